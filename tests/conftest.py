@@ -1,0 +1,28 @@
+"""Fixtures that every test may use."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+# The real inputs lie beside the project, never in it: a user has no such folder, and then these tests skip.
+SHARED_DATA = Path(os.environ.get("RENDRA_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--update-golden", action="store_true", help="draw the golden images anew")
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    """The folder of real inputs; skips where the machine has none."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no real inputs at {SHARED_DATA}")
+    return SHARED_DATA
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    """Every test starts from the same random state, whatever ran before it."""
+    torch.manual_seed(0)
