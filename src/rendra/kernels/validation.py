@@ -1,0 +1,45 @@
+"""What every kernel over packed faces demands of its input, checked once, in the caller's words."""
+
+import torch
+from torch import Tensor
+
+
+def check_faces(
+    face_verts: Tensor, first_face: Tensor, num_faces: Tensor, neighbor: Tensor | None
+) -> None:
+    """Shapes, types and devices of packed faces.
+
+    Raises:
+        ValueError: naming the argument, what it was and what was expected.
+    """
+    if face_verts.ndim != 3 or face_verts.shape[1:] != (3, 3) or not face_verts.is_floating_point():
+        raise ValueError(
+            f"face_verts must be floats of shape (F, 3, 3), got {face_verts.dtype} of {tuple(face_verts.shape)}"
+        )
+    if first_face.shape != num_faces.shape or first_face.ndim != 1:
+        raise ValueError(
+            "mesh_to_face_first_idx and num_faces_per_mesh must both have shape (N,), got "
+            f"{tuple(first_face.shape)} and {tuple(num_faces.shape)}"
+        )
+    if neighbor is not None and neighbor.shape != face_verts.shape[:1]:
+        raise ValueError(
+            f"clipped_faces_neighbor_idx must have shape ({len(face_verts)},), got {tuple(neighbor.shape)}"
+        )
+    for name, index in (
+        ("mesh_to_face_first_idx", first_face),
+        ("num_faces_per_mesh", num_faces),
+        ("clipped_faces_neighbor_idx", neighbor),
+    ):
+        if index is not None and (index.dtype != torch.int64 or index.device != face_verts.device):
+            raise ValueError(
+                f"{name} must be int64 on {face_verts.device}, got {index.dtype} on {index.device}"
+            )
+    if not index_is_inside(first_face, num_faces, len(face_verts)):
+        raise ValueError(f"mesh_to_face_first_idx + num_faces_per_mesh leaves the {len(face_verts)} faces given")
+
+
+def index_is_inside(first_face: Tensor, num_faces: Tensor, total: int) -> bool:
+    """Whether all face ranges lie in [0, total); on the CPU only: elsewhere torch itself checks on gathering."""
+    if first_face.device.type != "cpu" or not len(first_face):
+        return True
+    return bool(((first_face >= 0) & (num_faces >= 0) & (first_face + num_faces <= total)).all())
