@@ -34,12 +34,25 @@ def check_faces(
             raise ValueError(
                 f"{name} must be int64 on {face_verts.device}, got {index.dtype} on {index.device}"
             )
-    if not index_is_inside(first_face, num_faces, len(face_verts)):
+    if not _ranges_are_inside(first_face, num_faces, len(face_verts)):
         raise ValueError(f"mesh_to_face_first_idx + num_faces_per_mesh leaves the {len(face_verts)} faces given")
 
 
-def index_is_inside(first_face: Tensor, num_faces: Tensor, total: int) -> bool:
+def _ranges_are_inside(first_face: Tensor, num_faces: Tensor, total: int) -> bool:
     """Whether all face ranges lie in [0, total); on the CPU only: elsewhere torch itself checks on gathering."""
     if first_face.device.type != "cpu" or not len(first_face):
         return True
     return bool(((first_face >= 0) & (num_faces >= 0) & (first_face + num_faces <= total)).all())
+
+
+def check_raster(image_size: tuple[int, int], blur_radius: float) -> None:
+    """Size of the image and reach of a face.
+
+    Raises:
+        ValueError: naming the argument, what it was and what was expected.
+    """
+    height, width = image_size
+    if height < 1 or width < 1:
+        raise ValueError(f"image_size must be (height, width) of at least one pixel, got {tuple(image_size)}")
+    if not blur_radius >= 0:
+        raise ValueError(f"blur_radius must be zero or positive (squared NDC distance), got {blur_radius}")

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rendra.kernels.rasterize_meshes import numba_cpu, reference
-from rendra.kernels.validation import check_faces
+from rendra.kernels.validation import check_faces, check_raster
 
 __all__ = ["rasterize_meshes"]
 
@@ -47,20 +47,16 @@ def rasterize_meshes(
         ValueError: a shape, size, radius or index that cannot be.
     """
     check_faces(face_verts, mesh_to_face_first_idx, num_faces_per_mesh, clipped_faces_neighbor_idx)
-    height, width = image_size
-    if height < 1 or width < 1:
-        raise ValueError(f"image_size must be (height, width) of at least one pixel, got {tuple(image_size)}")
+    check_raster(image_size, blur_radius)
     if faces_per_pixel < 1:
         raise ValueError(f"faces_per_pixel must be at least 1, got {faces_per_pixel}")
-    if not blur_radius >= 0:
-        raise ValueError(f"blur_radius must be zero or positive (squared NDC distance), got {blur_radius}")
     if face_verts.device.type != "cpu" or face_verts.dtype != torch.float32:
         return reference.rasterize_meshes(
             face_verts, mesh_to_face_first_idx, num_faces_per_mesh, clipped_faces_neighbor_idx, image_size,
             blur_radius, faces_per_pixel, perspective_correct, clip_barycentric_coords, cull_backfaces,
         )  # fmt: skip
     return _rasterize_on_cpu(
-        face_verts, mesh_to_face_first_idx, num_faces_per_mesh, clipped_faces_neighbor_idx, height, width,
+        face_verts, mesh_to_face_first_idx, num_faces_per_mesh, clipped_faces_neighbor_idx, *image_size,
         float(blur_radius), faces_per_pixel, perspective_correct, clip_barycentric_coords, cull_backfaces,
     )  # fmt: skip
 
