@@ -1,0 +1,21 @@
+"""Batches of shapes whose members differ in size."""
+
+from rendra.structures.meshes import Meshes, join_meshes_as_batch, join_meshes_as_scene
+from rendra.structures.utils import (
+    list_to_packed,
+    list_to_padded,
+    packed_to_list,
+    padded_to_list,
+    padded_to_packed,
+)
+
+__all__ = [
+    "Meshes",
+    "join_meshes_as_batch",
+    "join_meshes_as_scene",
+    "list_to_packed",
+    "list_to_padded",
+    "packed_to_list",
+    "padded_to_list",
+    "padded_to_packed",
+]
