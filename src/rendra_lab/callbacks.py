@@ -1,0 +1,348 @@
+"""What accompanies a run: progress, timing, images, animations and meshes. The only writers of such files."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+
+from rendra_lab import visualization
+from rendra_lab.base_task import BaseTask
+from rendra_lab.loggers import TensorBoard
+
+
+def every(step: int, interval: int) -> bool:
+    """Whether a step, counted from 0, is due; an interval of 0 is never."""
+    return interval > 0 and step % interval == 0
+
+
+class Progress(ProgressBar):
+    """Steps, losses, speed and time left: a live line in a terminal, a printed line now and then elsewhere.
+
+    Args:
+        refresh_s: seconds between drawings in a terminal.
+        line_s: seconds between lines where the output is no terminal.
+    """
+
+    def __init__(self, refresh_s: float = 0.1, line_s: float = 10.0) -> None:
+        super().__init__()
+        self.interval_s = refresh_s if sys.stdout.isatty() else line_s
+        self._enabled = True
+        self._bar: Any = None
+        self._started = (0.0, 0)  # time and step at the start of the fit
+        self._drawn = 0.0
+
+    def disable(self) -> None:
+        """Lightning's switch: says nothing from now on."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Lightning's switch: speaks again."""
+        self._enabled = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Opens the line."""
+        self._started = (time.perf_counter(), trainer.global_step)
+        self._drawn = self._started[0]
+        if self._enabled and sys.stdout.isatty():
+            self._bar = _open_bar(_end_of(trainer), trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Draws, if enough time has passed since the last drawing."""
+        now = time.perf_counter()
+        if self._enabled and now - self._drawn >= self.interval_s:
+            self._drawn = now
+            self._draw(trainer)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draws the end and closes the line."""
+        if self._bar is not None:
+            self._draw(trainer)
+        self._close()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Gives the terminal back."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _draw(self, trainer: Trainer) -> None:
+        losses = {name.removeprefix("train/"): value for name, value in trainer.progress_bar_metrics.items()}
+        text = "  ".join(f"{name} {float(value):.4g}" for name, value in losses.items())
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=trainer.global_step, losses=text)
+            self._bar.refresh()
+            return
+        end = _end_of(trainer)
+        speed = (trainer.global_step - self._started[1]) / max(time.perf_counter() - self._started[0], 1e-9)
+        print_line = f"step {trainer.global_step}{'' if end is None else f'/{end}'}  {speed:.1f}/s  {text}\n"
+        sys.stdout.write(print_line)
+        sys.stdout.flush()
+
+
+def _end_of(trainer: Trainer) -> int | None:
+    total = trainer.estimated_stepping_batches
+    return int(total) if 0 < total < float("inf") else None
+
+
+def _open_bar(end: int | None, step: int) -> Any:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        BarColumn(30),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[losses]}"),
+    )
+    bar = Progress(*columns, auto_refresh=False)
+    bar.add_task("", total=end, completed=step, losses="")
+    bar.start()
+    return bar
+
+
+class StepTimer(Callback):
+    """Measures training steps, from their start to their end; the first one, which compiles, is left out."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=10_000)
+        self._start: float | None = None
+        self._warm = False
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Starts the clock."""
+        self._start = time.perf_counter()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stops the clock."""
+        if self._warm and self._start is not None:
+            self._seconds.append(time.perf_counter() - self._start)
+        self._warm = True
+
+    def median_ms(self) -> float | None:
+        """The median of the last ten thousand steps in milliseconds; None before the second step."""
+        return round(1000 * statistics.median(self._seconds), 3) if self._seconds else None
+
+
+class LastStepKeeper(Callback):
+    """Saves the state after the last step of a fit, be it finished, broken or interrupted.
+
+    Args:
+        path: of the checkpoint.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self._begun_at = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Notes where the fit begins."""
+        self._begun_at = trainer.global_step
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Saves the end."""
+        trainer.save_checkpoint(self.path)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Saves what an ended fit has reached, if it made a step."""
+        if trainer.training and trainer.global_step > self._begun_at:
+            trainer.save_checkpoint(self.path)
+
+
+class ImageLogger(Callback):
+    """Writes the panels of a task, side by side, as PNG files and to TensorBoard: the only writer of images.
+
+    The fit leaves `step_000050.png` at intervals, `final.png`, and `story.png`, which shows beginning, middle
+    and end in rows. Validation leaves its first batch.
+
+    Args:
+        folder: of the PNG files.
+        every_n_steps: interval during the fit; 0 shows the end alone.
+        max_files: when reached, every second file goes and the interval doubles.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 50, max_files: int = 64) -> None:
+        self.folder = Path(folder)
+        self.every_n_steps = every_n_steps
+        self.max_files = max_files
+        self._batch: Any = None
+        self._shown: list[tuple[int, dict[str, np.ndarray]]] = []
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Shows the state before a step that is due: the start of the fit first of all."""
+        self._batch = batch
+        if _shows(trainer, pl_module, "panels") and every(trainer.global_step, self.every_n_steps):
+            self._write(trainer, pl_module, f"step_{trainer.global_step:06d}.png")
+            self._thin_out()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Shows the end, and the way to it."""
+        if not _shows(trainer, pl_module, "panels") or self._batch is None:
+            return
+        self._write(trainer, pl_module, "final.png")
+        sheet = visualization.story([(f"step {step}", pictures) for step, pictures in _spread(self._shown, 4)])
+        visualization.save_picture(self.folder / "story.png", sheet)
+        self._batch, self._shown = None, []
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        """Shows the first batch of a validation."""
+        if batch_idx == 0 and not trainer.sanity_checking and _shows(trainer, pl_module, "panels"):
+            self._publish(trainer, _pictures(pl_module, batch), "val", f"val_{trainer.global_step:06d}.png")
+
+    def _write(self, trainer: Trainer, pl_module: LightningModule, name: str) -> None:
+        pictures = _pictures(pl_module, self._batch)
+        self._shown.append((trainer.global_step, pictures))
+        self._publish(trainer, pictures, "train", name)
+
+    def _publish(self, trainer: Trainer, pictures: dict[str, np.ndarray], stage: str, name: str) -> None:
+        if not pictures:
+            return
+        sheet = visualization.captioned_row(pictures)
+        visualization.save_picture(self.folder / name, sheet)
+        for writer in _writers(trainer):
+            writer.add_image(f"{stage}/panels", sheet, trainer.global_step, dataformats="HWC")
+
+    def _thin_out(self) -> None:
+        if len(self._shown) >= self.max_files:
+            for step, _ in self._shown[1::2]:
+                (self.folder / f"step_{step:06d}.png").unlink(missing_ok=True)
+            self._shown = self._shown[::2]
+            self.every_n_steps *= 2
+
+
+class AnimationWriter(Callback):
+    """Turns the panels of a fit into an animation.
+
+    Args:
+        path: of the file, .gif or .mp4 (extra [view]).
+        every_n_steps: interval between frames; 0 writes no animation.
+        max_frames: when reached, every second frame goes and the interval doubles.
+        fps: frames a second.
+        height_px: of the panels in a frame.
+    """
+
+    def __init__(
+        self, path: str, every_n_steps: int = 5, max_frames: int = 48, fps: float = 12.0, height_px: int = 192
+    ) -> None:
+        self.path = Path(path)
+        self.every_n_steps = every_n_steps
+        self.max_frames = max_frames
+        self.fps = fps
+        self.height_px = height_px
+        self._batch: Any = None
+        self._frames: list[np.ndarray] = []
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Keeps a frame of the state before a step that is due."""
+        self._batch = batch
+        if _shows(trainer, pl_module, "panels") and every(trainer.global_step, self.every_n_steps):
+            if len(self._frames) >= self.max_frames:
+                self._frames = self._frames[::2]
+                self.every_n_steps *= 2
+            if every(trainer.global_step, self.every_n_steps):
+                self._keep(pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the file."""
+        if self._frames and self._batch is not None:
+            self._keep(pl_module)
+            visualization.save_animation(self.path, self._frames, self.fps)
+        self._frames, self._batch = [], None
+
+    def _keep(self, pl_module: LightningModule) -> None:
+        pictures = _pictures(pl_module, self._batch)
+        if pictures:
+            self._frames.append(visualization.captioned_row(pictures, self.height_px))
+
+
+class MeshLogger(Callback):
+    """Shows the meshes of a task in TensorBoard at intervals, and leaves the final ones as PLY files.
+
+    Args:
+        folder: of the files.
+        every_n_steps: interval during the fit; 0 shows the end alone.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int = 200) -> None:
+        self.folder = Path(folder)
+        self.every_n_steps = every_n_steps
+        self._batch: Any = None
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Shows the state before a step that is due."""
+        self._batch = batch
+        if _shows(trainer, pl_module, "meshes") and every(trainer.global_step, self.every_n_steps):
+            self._show(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Shows the end and writes the files."""
+        if not _shows(trainer, pl_module, "meshes") or self._batch is None:
+            return
+        from rendra.io import IO
+
+        for name, meshes in self._show(trainer, pl_module).items():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for index in range(len(meshes)):
+                suffix = f"_{index}" if len(meshes) > 1 else ""
+                IO().save_mesh(meshes[index].detach().cpu(), self.folder / f"{name}{suffix}.ply")
+        self._batch = None
+
+    def _show(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        assert isinstance(pl_module, BaseTask)
+        shown = pl_module.show_meshes(self._batch)
+        for writer in _writers(trainer):
+            for name, meshes in shown.items():
+                _add_mesh(writer, name, meshes, trainer.global_step)
+        return shown
+
+
+def _add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:
+    colors = None
+    if meshes.textures is not None and hasattr(meshes.textures, "verts_features_padded"):
+        colors = (meshes.textures.verts_features_padded()[..., :3].detach().clamp(0, 1) * 255).round().int()
+    writer.add_mesh(
+        name,
+        vertices=meshes.verts_padded().detach().cpu(),
+        faces=meshes.faces_padded().clamp_min(0).cpu(),
+        colors=None if colors is None else colors.cpu(),
+        global_step=step,
+    )
+
+
+def _shows(trainer: Trainer, pl_module: LightningModule, what: str) -> bool:
+    """Whether the task draws such things at all, and this process is the one that writes."""
+    if not isinstance(pl_module, BaseTask) or not trainer.is_global_zero:
+        return False
+    return getattr(type(pl_module), what) is not getattr(BaseTask, what)
+
+
+def _pictures(pl_module: LightningModule, batch: Any) -> dict[str, np.ndarray]:
+    assert isinstance(pl_module, BaseTask)
+    return {name: visualization.to_picture(torch.as_tensor(image)) for name, image in pl_module.show(batch).items()}
+
+
+def _writers(trainer: Trainer) -> list[Any]:
+    return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoard)]
+
+
+def _spread(items: list[Any], count: int) -> list[Any]:
+    """At most `count` items, evenly spread, first and last among them."""
+    if len(items) <= count:
+        return items
+    return [items[round(index * (len(items) - 1) / (count - 1))] for index in range(count)]

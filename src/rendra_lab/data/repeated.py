@@ -1,0 +1,30 @@
+"""One batch again and again: the data loader of a fit to a single observation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+BatchT = TypeVar("BatchT")
+
+
+class Repeated(Generic[BatchT]):
+    """Yields the same batch a fixed number of times; one pass is one epoch.
+
+    Args:
+        batch: what every step gets.
+        times: steps an epoch, at least 1. An epoch costs some milliseconds: let it last the whole fit.
+    """
+
+    def __init__(self, batch: BatchT, times: int = 1) -> None:
+        if times < 1:
+            raise ValueError(f"a batch is repeated at least once, got times={times}")
+        self.batch = batch
+        self.times = times
+
+    def __len__(self) -> int:
+        return self.times
+
+    def __iter__(self) -> Iterator[BatchT]:
+        for _ in range(self.times):
+            yield self.batch

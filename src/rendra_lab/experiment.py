@@ -1,0 +1,417 @@
+"""The composition root: configuration in, run out. The only module that builds parts from Hydra's tree."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import logging
+import os
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning.pytorch import LightningDataModule, Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities.model_helpers import is_overridden
+from omegaconf import DictConfig, OmegaConf
+
+from rendra_lab import report
+from rendra_lab.base_task import BaseTask
+from rendra_lab.callbacks import StepTimer
+from rendra_lab.errors import UserError
+from rendra_lab.loggers import TensorBoard
+
+log = logging.getLogger(__name__)
+
+# A configuration may come from anywhere, and `_target_` calls what it names: only these are called.
+_ALLOWED_TARGETS = (
+    "rendra",
+    "rendra_lab",
+    "lightning.pytorch.Trainer",
+    "lightning.pytorch.callbacks",
+    "lightning.pytorch.plugins",
+    "lightning.pytorch.profilers",
+    "lightning.pytorch.strategies",
+    "torch.nn",
+    "torch.optim",
+    "torchmetrics",
+)
+_ALLOWED_HOMES = ("rendra", "rendra_lab", "lightning.pytorch", "torch.nn", "torch.optim", "torchmetrics")
+
+# What Lightning says that a user can do nothing about.
+_IDLE_WARNINGS = (
+    r".*does not have many workers.*",
+    r".*`val_dataloader`.*",
+    r".*is smaller than the logging interval.*",
+    r".*exists and is not empty.*",
+    r".*Checkpoint directory.*",
+    r".*IterableDataset.*has `__len__` defined.*",
+    r".*you defined a `validation_step` but have no `val_dataloader`.*",
+    r".*LeafSpec.*is deprecated.*",
+)
+
+
+@dataclass
+class Experiment:
+    """The built parts of one run."""
+
+    cfg: DictConfig
+    task: BaseTask
+    data: LightningDataModule
+    trainer: Trainer
+
+    @property
+    def folder(self) -> Path:
+        """Where this run writes."""
+        return Path(self.cfg.run_dir)
+
+
+def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
+    """Makes the parts that a configuration describes; calls nothing outside the allowed packages.
+
+    Args:
+        cfg: the composed configuration of `conf/train.yaml`, with `run_dir`.
+        observers: False leaves loggers and callbacks out, so that nothing is written.
+
+    Raises UserError for a forbidden `_target_` or an argument that it does not take, naming the key.
+    """
+    _quieten()
+    check_targets(OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True))
+    if cfg.threads is not None:
+        torch.set_num_threads(int(cfg.threads))
+    seed_everything(_seed(cfg), workers=True, verbose=False)
+    data = instantiate(cfg.data, _convert_="all")
+    task = instantiate(cfg.module, _convert_="all")
+    settings: dict[str, Any] = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    if observers:
+        callbacks = _parts(cfg.callbacks)
+        settings = {
+            "logger": _parts(cfg.logger) or False,
+            "callbacks": callbacks,
+            "enable_checkpointing": any(isinstance(callback, ModelCheckpoint) for callback in callbacks),
+            "enable_progress_bar": any(_is_progress(callback) for callback in callbacks),
+        }
+    return Experiment(cfg, task, data, instantiate(cfg.trainer, _convert_="all", **settings))
+
+
+def run(cfg: DictConfig) -> float | None:
+    """Builds, fits and tests; writes `metrics.json`, prints the numbers that matter and where they lie.
+
+    Returns the value of `optimized_metric`, or None where none is named. A failed run leaves its traceback in
+    the log file and a `metrics.json` with `status: failed`, and raises.
+    """
+    clock = _Clock()
+    folder = Path(cfg.run_dir)
+    record = _opening_record(cfg)
+    try:
+        experiment = build(cfg)
+        checkpoint = find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root))
+        clock.lap("setup")
+        record["resumed_from"] = None if checkpoint is None else str(checkpoint)
+        record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
+    except BaseException as error:
+        log.info("the run failed", exc_info=True)  # the console gets the message alone
+        record.update(status="failed", error=f"{type(error).__name__}: {error}"[:2000], seconds=clock.laps())
+        if _is_first_process():
+            report.write_json(folder / "metrics.json", record)
+        raise
+    record.update(status="ok", steps=experiment.trainer.global_step, seconds=clock.laps())
+    record.update(_measurements(experiment))
+    if experiment.trainer.is_global_zero:
+        _conclude(experiment, record)
+    return _optimized(record)
+
+
+def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, Any] | None = None) -> Experiment:
+    """Rebuilds a run from its folder, with the weights of its checkpoint; nothing is written.
+
+    Args:
+        folder: of the run.
+        weights: `last`, `best`, or the path of a checkpoint.
+        overrides: dotted keys of the configuration with other values.
+
+    Raises UserError where the folder holds no run, or no such checkpoint.
+    """
+    folder = Path(folder)
+    source = folder / ".hydra" / "config.yaml"
+    if not source.is_file():
+        raise UserError(f"{folder} is not the folder of a run: it has no .hydra/config.yaml")
+    cfg = OmegaConf.load(source)
+    assert isinstance(cfg, DictConfig)
+    cfg.run_dir = str(folder)
+    for key, value in (overrides or {}).items():
+        OmegaConf.update(cfg, key, value)
+    experiment = build(cfg, observers=False)
+    checkpoint = newest_checkpoint(folder) if weights == "last" else _named_checkpoint(folder, weights)
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    experiment.data.prepare_data()
+    experiment.data.setup("test")
+    experiment.task.load_state_dict(state["state_dict"])
+    experiment.task.eval()
+    return experiment
+
+
+def find_checkpoint(wanted: str | None, run_folder: Path, output_root: Path) -> Path | None:
+    """The checkpoint to resume from: None, a file, the newest of a run folder, or `last` of the same task."""
+    if wanted is None:
+        return None
+    if wanted == "last":
+        return newest_checkpoint(_task_folder(run_folder, output_root), besides=run_folder)
+    path = Path(wanted)
+    if path.is_dir():
+        return newest_checkpoint(path)
+    if not path.is_file():
+        raise UserError(f"ckpt_path: there is neither a checkpoint nor a run folder at {wanted}")
+    return path
+
+
+def newest_checkpoint(folder: Path, besides: Path | None = None) -> Path:
+    """The checkpoint written last in any run under `folder`, except the run `besides`."""
+    found = [path for path in folder.rglob("checkpoints/*.ckpt") if besides is None or besides not in path.parents]
+    if not found:
+        raise UserError(f"there is no checkpoint under {report.short_path(folder)}; start without ckpt_path")
+    return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name == "last.ckpt"))
+
+
+def check_targets(tree: Any, key: str = "") -> None:
+    """Refuses every `_target_` outside the allowed packages and every argument that a target does not take.
+
+    The environment variable RENDRA_LAB_PACKAGES names further packages, separated by commas: a plug-in is
+    trusted by whoever runs it, never by a configuration file.
+    """
+    if isinstance(tree, Mapping):
+        if "_target_" in tree:
+            _check_arguments(_locate(str(tree["_target_"]), key), tree, key)
+        for name, value in tree.items():
+            check_targets(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(tree, list):
+        for index, value in enumerate(tree):
+            check_targets(value, f"{key}[{index}]")
+
+
+def _locate(path: str, key: str) -> Any:
+    extra = tuple(name.strip() for name in os.environ.get("RENDRA_LAB_PACKAGES", "").split(",") if name.strip())
+    if not _below(path, _ALLOWED_TARGETS + extra):
+        raise UserError(
+            f"{key}: a configuration may not call {path!r}; allowed are {', '.join(_ALLOWED_TARGETS)}"
+            " and the packages named in RENDRA_LAB_PACKAGES"
+        )
+    target = _resolve(path, key)
+    home = getattr(target, "__module__", None) or type(target).__module__
+    if not _below(home, _ALLOWED_HOMES + extra) or not callable(target):
+        raise UserError(f"{key}: a configuration may not call {path!r}, which is {home}'s")
+    return target
+
+
+def _resolve(path: str, key: str) -> Any:
+    """The object under a dotted path: the longest importable module, then attributes."""
+    names = path.split(".")
+    for length in range(len(names) - 1, 0, -1):
+        module_name = ".".join(names[:length])
+        try:
+            target: Any = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not _below(module_name, (error.name,)):
+                raise  # the module exists; something that it imports does not
+            continue
+        for done, name in enumerate(names[length:], length):
+            if not hasattr(target, name):
+                near = difflib.get_close_matches(name, dir(target), 1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                raise UserError(f"{key}: {'.'.join(names[:done])} has no {name!r}{hint}")
+            target = getattr(target, name)
+        return target
+    raise UserError(f"{key}: there is no module {names[0]!r}, named by {path!r}")
+
+
+def _below(path: str, packages: tuple[str, ...]) -> bool:
+    return any(path == package or path.startswith(f"{package}.") for package in packages)
+
+
+def _check_arguments(target: Any, node: Mapping[str, Any], key: str) -> None:
+    try:
+        parameters = inspect.signature(target).parameters
+    except (TypeError, ValueError):
+        return
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    for name in node:
+        if name not in parameters and not (name.startswith("_") and name.endswith("_")):
+            near = difflib.get_close_matches(name, parameters, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"it takes: {', '.join(parameters)}"
+            raise UserError(f"{key}.{name}: {target.__qualname__} takes no {name!r}; {hint}")
+
+
+class _Clock:
+    """Seconds of the phases of a run."""
+
+    def __init__(self) -> None:
+        self._start = self._last = time.perf_counter()
+        self._laps: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        """Ends a phase."""
+        now = time.perf_counter()
+        self._laps[name] = round(now - self._last, 3)
+        self._last = now
+
+    def laps(self) -> dict[str, float]:
+        """Every ended phase, and the total until now."""
+        return {**self._laps, "total": round(time.perf_counter() - self._start, 3)}
+
+
+def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock) -> dict[str, float]:
+    trainer, task, data = experiment.trainer, experiment.task, experiment.data
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # a checkpoint is data, never code
+    trainer.fit(task, datamodule=data, ckpt_path=None if checkpoint is None else str(checkpoint))
+    clock.lap("fit")
+    metrics = _numbers(trainer)
+    if experiment.cfg.test is not None and is_overridden("test_dataloader", data, LightningDataModule):
+        best = _best_checkpoint(trainer) if experiment.cfg.test == "best" else None
+        trainer.test(task, datamodule=data, ckpt_path=best, verbose=False)
+        metrics.update(_numbers(trainer))
+        clock.lap("test")
+    return metrics
+
+
+def _best_checkpoint(trainer: Trainer) -> str:
+    keeper = trainer.checkpoint_callback
+    if not isinstance(keeper, ModelCheckpoint) or not keeper.best_model_path:
+        raise UserError(
+            "test=best needs callbacks.checkpoint.monitor, such as val/psnr, and a validation before the end"
+        )
+    return keeper.best_model_path
+
+
+def _named_checkpoint(folder: Path, weights: str) -> Path:
+    if weights != "best":
+        path = Path(weights)
+        if not path.is_file():
+            raise UserError(f"there is no checkpoint at {weights}; say last, best or a file")
+        return path
+    kept = [path for path in folder.glob("checkpoints/*.ckpt") if path.name != "last.ckpt"]
+    if not kept:
+        raise UserError(f"{folder} has no best checkpoint; say last")
+    return max(kept, key=lambda path: path.stat().st_mtime_ns)
+
+
+def _task_folder(run_folder: Path, output_root: Path) -> Path:
+    """outputs/<task>, for a run directly in it and for a job of a sweep."""
+    try:
+        relative = run_folder.resolve().relative_to(output_root.resolve())
+    except ValueError:
+        return run_folder.parent
+    return output_root / relative.parts[0] if len(relative.parts) > 1 else run_folder.parent
+
+
+def _numbers(trainer: Trainer) -> dict[str, float]:
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def _measurements(experiment: Experiment) -> dict[str, Any]:
+    timers = [callback for callback in experiment.trainer.callbacks if isinstance(callback, StepTimer)]  # type: ignore[attr-defined]
+    device = experiment.trainer.strategy.root_device
+    return {
+        "step_ms_median": timers[0].median_ms() if timers else None,
+        "peak_memory_mb": report.peak_memory_mb(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+    }
+
+
+def _opening_record(cfg: DictConfig) -> dict[str, Any]:
+    known = HydraConfig.get() if HydraConfig.initialized() else None
+    return {
+        "status": "running",
+        "task": known.runtime.choices.get("task", "task") if known else "task",
+        "overrides": list(known.overrides.task) if known else [],
+        "seed": cfg.seed,
+        "optimized_metric": cfg.optimized_metric,
+        "direction": cfg.direction,
+        "steps": 0,
+        "metrics": {},
+        "threads": torch.get_num_threads() if cfg.threads is None else int(cfg.threads),
+        "versions": report.versions(),
+        "git_commit": report.git_commit(Path(__file__).parent),
+        "command": " ".join(sys.argv),
+    }
+
+
+def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
+    for logger in experiment.trainer.loggers:
+        if isinstance(logger, TensorBoard):
+            logger.log_hyperparams(hyperparameters(experiment.cfg), record["metrics"])
+            logger.close()
+    report.write_json(experiment.folder / "metrics.json", record)
+    report.closing_table(record, experiment.folder)
+
+
+def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
+    """The numbers, words and switches that distinguish runs, by dotted key, for TensorBoard's HPARAMS tab."""
+    skipped = {"trainer", "logger", "callbacks", "module", "run_dir", "output_root", "ckpt_path", "direction"}
+    tree = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(tree, dict)
+    tree["module"] = {
+        key: value
+        for key, value in tree["module"].items()
+        if key not in ("losses", "metrics", "optimizer", "scheduler")
+    }
+    skipped.discard("module")
+    flat = {key: value for name in tree if name not in skipped for key, value in _leaves(tree[name], str(name))}
+    return {**flat, "trainer.max_steps": tree["trainer"].get("max_steps")}
+
+
+def _leaves(tree: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(tree, dict):
+        for name, value in tree.items():
+            if not str(name).startswith("_"):
+                yield from _leaves(value, f"{key}.{name}")
+    elif isinstance(tree, (bool, int, float, str)):
+        yield key, tree
+    elif isinstance(tree, list):
+        yield key, str(tree)
+
+
+def _optimized(record: Mapping[str, Any]) -> float | None:
+    name = record["optimized_metric"]
+    if name is None:
+        return None
+    if name not in record["metrics"]:
+        raise UserError(f"optimized_metric: this run has no {name!r}; it has: {', '.join(record['metrics'])}")
+    return record["metrics"][name]
+
+
+def _parts(group: DictConfig | None) -> list[Any]:
+    """The parts of a group by name, without those switched off by null."""
+    built = instantiate(group, _convert_="all") if group else {}
+    return [part for part in built.values() if part is not None]
+
+
+def _is_progress(callback: Any) -> bool:
+    from lightning.pytorch.callbacks import ProgressBar
+
+    return isinstance(callback, ProgressBar)
+
+
+def _is_first_process() -> bool:
+    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+
+
+def _seed(cfg: DictConfig) -> int:
+    if not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool):
+        raise UserError(f"seed must be a whole number, got {cfg.seed!r}")
+    return cfg.seed
+
+
+def _quieten() -> None:
+    for pattern in _IDLE_WARNINGS:
+        warnings.filterwarnings("ignore", message=pattern)
+    for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
+        logging.getLogger(name).setLevel(logging.WARNING)

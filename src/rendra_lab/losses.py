@@ -1,0 +1,85 @@
+"""Losses that several tasks use. Each takes the prediction, then the target, and returns a scalar.
+
+Shapes: images are (B, H, W, C), masks (B, H, W), but every loss here takes any shape that broadcasts.
+A mask is a weight per element in [0, 1], broadcast against the error; its mean then runs over the weight.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class SquaredError:
+    """The mean of squared differences, as a sum of squares that Gauss-Newton methods can use."""
+
+    def __call__(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        """The mean of (prediction - target)^2 over the elements, weighted by the mask: a scalar."""
+        return _mean((prediction - target).square(), mask)
+
+    def residuals(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        """The vector (R,) whose squared length is the value of the call."""
+        difference = prediction - target
+        if mask is None:
+            return difference.reshape(-1) / max(difference.numel(), 1) ** 0.5
+        weight = _broadcast_mask(mask, difference)
+        return (difference * (weight / weight.sum().clamp_min(1e-12)).sqrt()).reshape(-1)
+
+
+class SummedSquaredError:
+    """The sum of squared differences: the book's silhouette loss, which grows with the image."""
+
+    def __call__(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """The sum of (prediction - target)^2: a scalar."""
+        return (prediction - target).square().sum()
+
+    def residuals(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """The differences as a vector (R,)."""
+        return (prediction - target).reshape(-1)
+
+
+def absolute_error(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The mean of |prediction - target|, weighted by the mask: a scalar."""
+    return _mean((prediction - target).abs(), mask)
+
+
+def huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, delta: float = 0.1) -> Tensor:
+    """The mean of d^2 / 2 where |d| <= delta, else delta (|d| - delta / 2), d = prediction - target."""
+    size = (prediction - target).abs()
+    near = size.clamp(max=delta)
+    return _mean(near * (size - 0.5 * near), mask)
+
+
+def silhouette_iou(prediction: Tensor, target: Tensor) -> Tensor:
+    """One minus the soft intersection over union of two coverages in [0, 1], averaged over the batch.
+
+    Shapes: (B, H, W) both. Intersection is the sum of p t, union of p + t - p t; two empty masks agree (0).
+    Source: Liu et al., "Soft Rasterizer", ICCV 2019, Eq. 8.
+    """
+    both = (prediction * target).flatten(1).sum(1)
+    either = (prediction + target - prediction * target).flatten(1).sum(1)
+    return (1 - torch.where(either > 0, both / either.clamp_min(1e-12), torch.ones_like(both))).mean()
+
+
+def binary_cross_entropy(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The mean of -t log p - (1 - t) log(1 - p) of probabilities in [0, 1]; finite at 0 and 1: a scalar."""
+    safe = prediction.clamp(1e-6, 1 - 1e-6)
+    return _mean(-(target * safe.log() + (1 - target) * (1 - safe).log()), mask)
+
+
+def mean_square(prediction: Tensor) -> Tensor:
+    """The mean of squares of the prediction alone: the simplest regulariser."""
+    return prediction.square().mean()
+
+
+def _mean(error: Tensor, mask: Tensor | None) -> Tensor:
+    if mask is None:
+        return error.mean()
+    weight = _broadcast_mask(mask, error)
+    return (error * weight).sum() / weight.sum().clamp_min(1e-12)
+
+
+def _broadcast_mask(mask: Tensor, error: Tensor) -> Tensor:
+    """A mask (B, H, W) meets an image (B, H, W, C) at its last dimension."""
+    mask = mask.to(error.dtype)
+    return (mask[..., None] if mask.ndim == error.ndim - 1 else mask).expand_as(error)

@@ -1,0 +1,76 @@
+"""The only home of metrics. Each takes the prediction, then the target, and returns a scalar.
+
+Shapes: images are (B, H, W, C) or (H, W, C) with values in [0, 1]; masks and silhouettes (B, H, W) or (H, W).
+An average over a batch is the mean over images, as published tables have it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_PSNR_CEILING_DB = 100.0  # of two equal images
+
+
+def mean_squared_error(prediction: Tensor, target: Tensor) -> Tensor:
+    """The mean of (prediction - target)^2."""
+    return (prediction - target).square().mean()
+
+
+def mean_absolute_error(prediction: Tensor, target: Tensor) -> Tensor:
+    """The mean of |prediction - target|."""
+    return (prediction - target).abs().mean()
+
+
+def psnr(prediction: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB for a peak of 1, the mean over images; equal images get 100 dB."""
+    prediction, target = _batched(prediction, target)
+    error = (prediction - target).square().flatten(1).mean(1)
+    return (-10 * error.clamp_min(10 ** (-_PSNR_CEILING_DB / 10)).log10()).mean()
+
+
+def ssim(prediction: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity in [-1, 1], the mean over images, channels and pixels.
+
+    Gaussian window of 11 x 11 and sigma 1.5, K1 = 0.01, K2 = 0.03, population moments, only windows that lie
+    inside the image. Source: Wang et al., "Image quality assessment", IEEE TIP 2004, Eq. 13.
+    Raises ValueError for an image smaller than the window.
+    """
+    prediction, target = (image.movedim(-1, 1) for image in _batched(prediction, target))
+    if min(prediction.shape[-2:]) < 11:
+        raise ValueError(f"ssim needs at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
+    mean_p, mean_t = _blur(prediction), _blur(target)
+    variance_p = _blur(prediction.square()) - mean_p.square()
+    variance_t = _blur(target.square()) - mean_t.square()
+    covariance = _blur(prediction * target) - mean_p * mean_t
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_p * mean_t + c1) / (mean_p.square() + mean_t.square() + c1)
+    structure = (2 * covariance + c2) / (variance_p + variance_t + c2)
+    return (luminance * structure).mean()
+
+
+def iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
+    """Intersection over union of two masks, cut at the threshold, the mean over images; empty masks agree."""
+    prediction, target = _batched(prediction, target, dims=3)
+    predicted, wanted = prediction > threshold, target > threshold
+    both = (predicted & wanted).flatten(1).sum(1)
+    either = (predicted | wanted).flatten(1).sum(1)
+    return torch.where(either > 0, both / either.clamp_min(1), torch.ones_like(both, dtype=torch.float)).mean()
+
+
+def _batched(prediction: Tensor, target: Tensor, dims: int = 4) -> tuple[Tensor, Tensor]:
+    if prediction.shape != target.shape:
+        raise ValueError(
+            f"prediction and target differ in shape: {tuple(prediction.shape)} and {tuple(target.shape)}"
+        )
+    return (prediction, target) if prediction.ndim == dims else (prediction[None], target[None])
+
+
+def _blur(image: Tensor) -> Tensor:
+    """Convolves (B, C, H, W) with the Gaussian window, one axis at a time, without padding."""
+    channels = image.shape[1]
+    offset = torch.arange(-5, 6, device=image.device, dtype=image.dtype)
+    window = torch.softmax(-offset.square() / (2 * 1.5**2), 0).expand(channels, 1, 1, 11)
+    across = functional.conv2d(image, window, groups=channels)
+    return functional.conv2d(across, window.transpose(-1, -2), groups=channels)

@@ -1,0 +1,30 @@
+"""Learning-rate schedules that know where the run ends. `total_steps` is filled in by the task."""
+
+from __future__ import annotations
+
+import math
+
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+
+def cosine(optimizer: Optimizer, total_steps: int, final_factor: float = 0.01, warmup_steps: int = 0) -> LambdaLR:
+    """Half a cosine from the optimizer's rate down to `final_factor` times it, after a linear warm-up.
+
+    Source: Loshchilov and Hutter, "SGDR", ICLR 2017, Eq. 5, without restarts.
+    """
+
+    def factor(step: int) -> float:
+        if step < warmup_steps:
+            return (step + 1) / (warmup_steps + 1)
+        progress = min((step - warmup_steps) / max(total_steps - warmup_steps, 1), 1.0)
+        return final_factor + (1 - final_factor) * 0.5 * (1 + math.cos(math.pi * progress))
+
+    return LambdaLR(optimizer, factor)
+
+
+def exponential(optimizer: Optimizer, total_steps: int, final_factor: float = 0.1) -> LambdaLR:
+    """The rate falls by the same factor every step and ends at `final_factor` times the optimizer's rate."""
+    if final_factor <= 0:
+        raise ValueError(f"final_factor must be above 0, got {final_factor}")
+    return LambdaLR(optimizer, lambda step: final_factor ** (step / max(total_steps, 1)))
