@@ -1,0 +1,150 @@
+"""`IO`: any mesh or point cloud file, by its suffix."""
+
+from collections import deque
+from typing import Any
+
+from rendra.common.datatypes import Device
+from rendra.io._source import FileLike, PathManager
+from rendra.io.obj_io import MeshObjFormat
+from rendra.io.pluggable_formats import MeshFormatInterpreter, PointcloudFormatInterpreter
+from rendra.io.ply_io import MeshPlyFormat
+from rendra.structures import Meshes
+
+
+class IO:
+    """Reads and writes meshes and point clouds in every registered format.
+
+    The format registered last is asked first.
+
+    Args:
+        include_default_formats: register OBJ and PLY.
+        path_manager: interprets all paths, as `iopath.common.file_io.PathManager` does; None for plain files.
+
+    Attributes:
+        path_manager: as given.
+        mesh_interpreters, pointcloud_interpreters: the registered formats, in the order of asking.
+    """
+
+    def __init__(self, include_default_formats: bool = True, path_manager: PathManager | None = None) -> None:
+        self.path_manager = path_manager
+        self.mesh_interpreters: deque[MeshFormatInterpreter] = deque()
+        self.pointcloud_interpreters: deque[PointcloudFormatInterpreter] = deque()
+        if include_default_formats:
+            self.register_default_formats()
+
+    def register_default_formats(self) -> None:
+        """Register the formats that come with this package."""
+        self.register_meshes_format(MeshObjFormat())
+        self.register_meshes_format(MeshPlyFormat())
+
+    def register_meshes_format(self, interpreter: MeshFormatInterpreter) -> None:
+        """Add a mesh format, to be asked before all others.
+
+        Raises:
+            ValueError: it is no MeshFormatInterpreter.
+        """
+        if not isinstance(interpreter, MeshFormatInterpreter):
+            raise ValueError(
+                f"Invalid interpreter: expected a MeshFormatInterpreter, got {type(interpreter).__name__}"
+            )
+        self.mesh_interpreters.appendleft(interpreter)
+
+    def register_pointcloud_format(self, interpreter: PointcloudFormatInterpreter) -> None:
+        """Add a point cloud format, to be asked before all others.
+
+        Raises:
+            ValueError: it is no PointcloudFormatInterpreter.
+        """
+        if not isinstance(interpreter, PointcloudFormatInterpreter):
+            raise ValueError(
+                f"Invalid interpreter: expected a PointcloudFormatInterpreter, got {type(interpreter).__name__}"
+            )
+        self.pointcloud_interpreters.appendleft(interpreter)
+
+    def load_mesh(
+        self, path: FileLike, include_textures: bool = True, device: Device = "cpu", **kwargs: Any
+    ) -> Meshes:
+        """Read a mesh file into a batch of one.
+
+        Args:
+            path: path; an open handle only with formats that look at the content instead of the suffix.
+            include_textures: read textures too.
+            device: where the tensors go.
+            kwargs: options of the format, such as `create_texture_atlas` for OBJ.
+
+        Raises:
+            ValueError: no registered format reads this file.
+            MeshFormatError: the file is malformed.
+        """
+        for interpreter in self.mesh_interpreters:
+            mesh = interpreter.read(
+                path, include_textures=include_textures, device=device, path_manager=self.path_manager, **kwargs
+            )
+            if mesh is not None:
+                return mesh
+        raise ValueError(f"No mesh interpreter found to read {path}.{_known(self.mesh_interpreters)}")
+
+    def save_mesh(
+        self,
+        data: Meshes,
+        path: FileLike,
+        binary: bool | None = None,
+        include_textures: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        """Write a batch of one mesh.
+
+        Args:
+            data: the mesh.
+            path: its suffix chooses the format.
+            binary: binary or text, where the format has both; None for its own choice.
+            include_textures: write textures and colours too, where the format can.
+            kwargs: options of the format, such as `decimal_places` or PLY's `colors_as_uint8`.
+
+        Raises:
+            ValueError: no registered format writes this file, or the batch has not exactly one mesh.
+        """
+        if not isinstance(data, Meshes):
+            raise ValueError(f"save_mesh() expects a Meshes object, got {type(data).__name__}")
+        for interpreter in self.mesh_interpreters:
+            if interpreter.save(
+                data,
+                path,
+                path_manager=self.path_manager,
+                binary=binary,
+                include_textures=include_textures,
+                **kwargs,
+            ):
+                return
+        raise ValueError(f"No mesh interpreter found to write to {path}.{_known(self.mesh_interpreters)}")
+
+    def load_pointcloud(self, path: FileLike, device: Device = "cpu", **kwargs: Any) -> Any:
+        """Read a point cloud file into a batch of one.
+
+        Raises:
+            ValueError: no registered format reads this file.
+        """
+        for interpreter in self.pointcloud_interpreters:
+            cloud = interpreter.read(path, device=device, path_manager=self.path_manager, **kwargs)
+            if cloud is not None:
+                return cloud
+        raise ValueError(f"No point cloud interpreter found to read {path}.{_known(self.pointcloud_interpreters)}")
+
+    def save_pointcloud(self, data: Any, path: FileLike, binary: bool | None = None, **kwargs: Any) -> None:
+        """Write a batch of one point cloud.
+
+        Raises:
+            ValueError: no registered format writes this file.
+        """
+        for interpreter in self.pointcloud_interpreters:
+            if interpreter.save(data, path, path_manager=self.path_manager, binary=binary, **kwargs):
+                return
+        raise ValueError(
+            f"No point cloud interpreter found to write to {path}.{_known(self.pointcloud_interpreters)}"
+        )
+
+
+def _known(interpreters: deque[Any]) -> str:
+    """The suffixes that would have worked."""
+    suffixes = {suffix for each in interpreters for suffix in getattr(each, "known_suffixes", ())}
+    return f" Registered: {', '.join(sorted(suffixes))}." if suffixes else " No format is registered."
