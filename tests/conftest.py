@@ -26,3 +26,15 @@ def shared_data() -> Path:
 def _seeded() -> None:
     """Every test starts from the same random state, whatever ran before it."""
     torch.manual_seed(0)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Drop compiled kernels that are older than any kernel's source.
+
+    Numba's cache watches the file of the compiled function alone, not those of the functions that it calls.
+    """
+    kernels = Path(__file__).parents[1] / "src" / "rendra" / "kernels"
+    newest = max(source.stat().st_mtime for source in kernels.rglob("*.py"))
+    for compiled in kernels.rglob("*.nb[ic]"):
+        if compiled.stat().st_mtime < newest:
+            compiled.unlink(missing_ok=True)

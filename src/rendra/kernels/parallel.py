@@ -39,7 +39,7 @@ if hasattr(os, "register_at_fork"):
 
 def num_threads() -> int:
     """Threads that a kernel uses: torch's number, within what Numba started with."""
-    return max(1, min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    return max(1, min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
 def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -76,3 +76,8 @@ def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 scalar_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Decorator for the small functions that kernels call."""
+
+reassociating_kernel = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"}
+)
+"""The same for sums whose order may follow the vector units: still the same on every run and thread count."""

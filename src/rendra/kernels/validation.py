@@ -1,12 +1,11 @@
 """What every kernel over packed faces demands of its input, checked once, in the caller's words."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
 
-def check_faces(
-    face_verts: Tensor, first_face: Tensor, num_faces: Tensor, neighbor: Tensor | None
-) -> None:
+def check_faces(face_verts: Tensor, first_face: Tensor, num_faces: Tensor, neighbor: Tensor | None) -> None:
     """Shapes, types and devices of packed faces.
 
     Raises:
@@ -31,9 +30,7 @@ def check_faces(
         ("clipped_faces_neighbor_idx", neighbor),
     ):
         if index is not None and (index.dtype != torch.int64 or index.device != face_verts.device):
-            raise ValueError(
-                f"{name} must be int64 on {face_verts.device}, got {index.dtype} on {index.device}"
-            )
+            raise ValueError(f"{name} must be int64 on {face_verts.device}, got {index.dtype} on {index.device}")
     if not _ranges_are_inside(first_face, num_faces, len(face_verts)):
         raise ValueError(f"mesh_to_face_first_idx + num_faces_per_mesh leaves the {len(face_verts)} faces given")
 
@@ -56,3 +53,8 @@ def check_raster(image_size: tuple[int, int], blur_radius: float) -> None:
         raise ValueError(f"image_size must be (height, width) of at least one pixel, got {tuple(image_size)}")
     if not blur_radius >= 0:
         raise ValueError(f"blur_radius must be zero or positive (squared NDC distance), got {blur_radius}")
+
+
+def neighbor_array(neighbor: Tensor | None, num_faces: int) -> np.ndarray:
+    """The clipped halves' partners as kernels read them: (F,) int64, -1 where there is none."""
+    return np.full(num_faces, -1) if neighbor is None else neighbor.contiguous().numpy()

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rendra.kernels.rasterize_meshes import numba_cpu, reference
-from rendra.kernels.validation import check_faces, check_raster
+from rendra.kernels.validation import check_faces, check_raster, neighbor_array
 
 __all__ = ["rasterize_meshes"]
 
@@ -76,12 +76,11 @@ def _rasterize_on_cpu(
     cull: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     outputs = _outputs(face_verts, first_face, height, width, layers)
-    no_neighbor = torch.full((len(face_verts),), -1, dtype=torch.int64) if neighbor is None else neighbor
     numba_cpu.forward(
-        face_verts.detach().contiguous().numpy(),
+        face_verts.contiguous().numpy(),
         first_face.numpy(),
         num_faces.numpy(),
-        no_neighbor.contiguous().numpy(),
+        neighbor_array(neighbor, len(face_verts)),
         (height, width),
         blur_radius,
         layers,
@@ -109,23 +108,37 @@ def _outputs(
     )
 
 
+@torch.library.custom_op("rendra::rasterize_meshes_backward", mutates_args=(), device_types="cpu")
+def _gradient_on_cpu(
+    face_verts: Tensor,
+    pix_to_face: Tensor,
+    perspective: bool,
+    clip: bool,
+    grad_zbuf: Tensor | None,
+    grad_bary: Tensor | None,
+    grad_dists: Tensor | None,
+) -> Tensor:
+    grads = [None if grad is None else grad.contiguous().numpy() for grad in (grad_zbuf, grad_bary, grad_dists)]
+    grad = numba_cpu.backward(
+        face_verts.contiguous().numpy(), pix_to_face.numpy(), (perspective, clip), (grads[0], grads[1], grads[2])
+    )
+    return torch.from_numpy(grad)
+
+
+@_gradient_on_cpu.register_fake
+def _(face_verts, pix_to_face, perspective, clip, grad_zbuf, grad_bary, grad_dists):  # type: ignore[no-untyped-def]
+    return torch.empty_like(face_verts, memory_format=torch.contiguous_format)
+
+
 def _remember(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
     ctx.save_for_backward(inputs[0], output[0])
-    ctx.flags = (inputs[8], inputs[9])
+    ctx.flags = inputs[8:10]
     ctx.mark_non_differentiable(output[0])
     ctx.set_materialize_grads(False)
 
 
-def _gradient(ctx, _, grad_zbuf, grad_bary, grad_dists):  # type: ignore[no-untyped-def]
-    face_verts, pix_to_face = ctx.saved_tensors
-    grads = [
-        None if grad is None else grad.detach().contiguous().numpy()
-        for grad in (grad_zbuf, grad_bary, grad_dists)
-    ]
-    grad = numba_cpu.backward(
-        face_verts.detach().contiguous().numpy(), pix_to_face.numpy(), ctx.flags, (grads[0], grads[1], grads[2])
-    )
-    return torch.from_numpy(grad), *[None] * 10
+def _gradient(ctx, _, *grads):  # type: ignore[no-untyped-def]
+    return _gradient_on_cpu(*ctx.saved_tensors, *ctx.flags, *grads), *[None] * 10
 
 
 _rasterize_on_cpu.register_autograd(_gradient, setup_context=_remember)

@@ -20,12 +20,13 @@ from rendra.kernels.geometry import (
     barycentric,
     clip_barycentric,
     edge_function,
+    face_row,
     perspective_barycentric,
     pixel_centre,
     point_segment,
     signed_distance,
-    signed_distance_row,
     surface_point,
+    whole_blocks,
 )
 from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 
@@ -124,9 +125,7 @@ def _fill_depth(v, f, box, row, row_end, columns, short, perspective, clip, pix_
 def _describe_hit(v, px, py, perspective, clip, bary, dists, k):
     """Barycentric coordinates and signed distance of a hit that was kept."""
     x0, y0, x1, y1, x2, y2 = v[0, 0], v[0, 1], v[1, 0], v[1, 1], v[2, 0], v[2, 1]
-    w0, w1, w2, _ = surface_point(
-        px, py, x0, y0, v[0, 2], x1, y1, v[1, 2], x2, y2, v[2, 2], perspective, clip
-    )
+    w0, w1, w2, _ = surface_point(px, py, x0, y0, v[0, 2], x1, y1, v[1, 2], x2, y2, v[2, 2], perspective, clip)
     bary[0], bary[1], bary[2] = w0, w1, w2
     dists[k] = signed_distance(px, py, x0, y0, x1, y1, x2, y2)
 
@@ -141,7 +140,7 @@ def _draw_layers(
     short = min(height, width)
     for worker in prange(workers):
         columns = padded_columns(height, width)
-        row_dists = np.empty(width + BLOCK, np.float32)
+        row_dists, rivals = np.empty(width + BLOCK, np.float32), np.empty(width + BLOCK, np.float32)
         counts = np.empty((BAND_ROWS, width), np.int32)
         for band in range(worker, images * bands, workers):
             n, row = band // bands, band % bands * BAND_ROWS
@@ -151,7 +150,7 @@ def _draw_layers(
                 f = faces[entry]
                 for y in range(max(boxes[f, 2], row), min(boxes[f, 3], row_end)):
                     _collect_row(face_verts, f, boxes[f], pixel_centre(y, height, short), columns, neighbor,
-                                 blur, perspective, clip, row_dists, counts[y - row],
+                                 blur, perspective, clip, row_dists, rivals, counts[y - row],
                                  pix_to_face[n, y], zbuf[n, y])  # fmt: skip
             for y in range(row, row_end):
                 py = pixel_centre(y, height, short)
@@ -169,32 +168,33 @@ def _draw_layers(
 
 @scalar_kernel
 def _collect_row(
-    face_verts, f, box, py, columns, neighbor, blur, perspective, clip, row_dists, counts, pix_to_face, zbuf
+    face_verts,
+    f,
+    box,
+    py,
+    columns,
+    neighbor,
+    blur,
+    perspective,
+    clip,
+    row_dists,
+    rivals,
+    counts,
+    pix_to_face,
+    zbuf,
 ):
     """Offer the hits of one face in one row to the sorted lists of their pixels."""
     v = face_verts[f]
     x0, y0, z0, x1, y1, z1 = v[0, 0], v[0, 1], v[0, 2], v[1, 0], v[1, 1], v[1, 2]
     x2, y2, z2 = v[2, 0], v[2, 1], v[2, 2]
     first, end = box[0], box[1]
-    signed_distance_row(columns, first, end - first, py, x0, y0, x1, y1, x2, y2, row_dists)
+    face_row(face_verts, f, neighbor[f], whole_blocks(columns, first, end), py, row_dists, rivals)
     for x in range(first, end):
-        d = row_dists[x - first]
-        if not (d < ZERO or d < blur):
-            continue
-        px = columns[x]
-        if neighbor[f] >= 0 and not wins_over_neighbor(face_verts, f, neighbor[f], px, py, d):
-            continue
-        z = surface_point(px, py, x0, y0, z0, x1, y1, z1, x2, y2, z2, perspective, clip)[3]
-        if z >= ZERO:
-            counts[x] = _insert(z, f, counts[x], pix_to_face[x], zbuf[x])
-
-
-@scalar_kernel
-def wins_over_neighbor(face_verts, f, other, px, py, d):
-    """Of the two halves of a clipped face only the nearer one is kept: lower signed distance, then lower index."""
-    v = face_verts[other]
-    rival = signed_distance(px, py, v[0, 0], v[0, 1], v[1, 0], v[1, 1], v[2, 0], v[2, 1])
-    return d < rival or (d == rival and f < other)
+        if row_dists[x - first] < blur:
+            px = columns[x]
+            z = surface_point(px, py, x0, y0, z0, x1, y1, z1, x2, y2, z2, perspective, clip)[3]
+            if z >= ZERO:
+                counts[x] = _insert(z, f, counts[x], pix_to_face[x], zbuf[x])
 
 
 @scalar_kernel

@@ -64,9 +64,7 @@ def rasterize_meshes(
 def pixel_centres(image_size: tuple[int, int], like: Tensor) -> Tensor:
     """NDC (H, W, 2) of the pixel centres: +X left, +Y up, the short side spans [-1, 1]."""
     short = min(image_size)
-    axes = [
-        torch.arange(size - 1, -size, -2, dtype=like.dtype, device=like.device) / short for size in image_size
-    ]
+    axes = [torch.arange(size - 1, -size, -2, dtype=like.dtype, device=like.device) / short for size in image_size]
     y, x = torch.meshgrid(*axes, indexing="ij")
     return torch.stack([x, y], dim=-1)
 
@@ -118,9 +116,7 @@ def _nearest_hits(
     result = torch.full((height, width, layers), -1, dtype=torch.int64, device=face_verts.device)
     for rows, candidates in row_bands(face_verts, faces, pixels, blur_radius):
         centres = pixels[rows].reshape(-1, 2)
-        kept, depth, _ = hit_pairs(
-            centres, face_verts, candidates, neighbor, blur_radius, perspective_correct, clip
-        )
+        kept, depth, _ = hit_pairs(centres, face_verts, candidates, neighbor, blur_radius, perspective_correct, clip)
         # candidates ascend, and the sort is stable: ties go to the lower face index
         depth = torch.where(kept, depth, torch.inf)
         order = depth.argsort(dim=1, stable=True)[:, :layers]

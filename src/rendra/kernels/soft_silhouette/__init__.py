@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rendra.kernels.soft_silhouette import numba_cpu, reference
-from rendra.kernels.validation import check_faces, check_raster
+from rendra.kernels.validation import check_faces, check_raster, neighbor_array
 
 __all__ = ["soft_silhouette"]
 
@@ -71,8 +71,8 @@ def _survival_on_cpu(
 ) -> tuple[Tensor, Tensor]:
     survival = face_verts.new_empty((len(first_face), height, width))
     boxes = numba_cpu.forward(
-        face_verts.detach().contiguous().numpy(), first_face.numpy(), num_faces.numpy(),
-        _neighbor_array(face_verts, neighbor), blur_radius, sigma, cull, survival.numpy(),
+        face_verts.contiguous().numpy(), first_face.numpy(), num_faces.numpy(),
+        neighbor_array(neighbor, len(face_verts)), blur_radius, sigma, cull, survival.numpy(),
     )  # fmt: skip
     return survival, torch.from_numpy(boxes)
 
@@ -83,25 +83,38 @@ def _(face_verts, first_face, num_faces, neighbor, height, width, blur_radius, s
     return survival, face_verts.new_empty((len(face_verts), 4), dtype=torch.int32)
 
 
-def _neighbor_array(face_verts: Tensor, neighbor: Tensor | None):  # type: ignore[no-untyped-def]
-    if neighbor is None:
-        neighbor = torch.full((len(face_verts),), -1, dtype=torch.int64)
-    return neighbor.contiguous().numpy()
+@torch.library.custom_op("rendra::soft_silhouette_backward", mutates_args=(), device_types="cpu")
+def _gradient_on_cpu(
+    face_verts: Tensor,
+    first_face: Tensor,
+    num_faces: Tensor,
+    neighbor: Tensor | None,
+    boxes: Tensor,
+    blur_radius: float,
+    sigma: float,
+    upstream: Tensor,
+) -> Tensor:
+    grad = numba_cpu.backward(
+        face_verts.contiguous().numpy(), boxes.numpy(), first_face.numpy(), num_faces.numpy(),
+        neighbor_array(neighbor, len(face_verts)), blur_radius, sigma, upstream.contiguous().numpy(),
+    )  # fmt: skip
+    return torch.from_numpy(grad)
+
+
+@_gradient_on_cpu.register_fake
+def _(face_verts, first_face, num_faces, neighbor, boxes, blur_radius, sigma, upstream):  # type: ignore[no-untyped-def]
+    return torch.empty_like(face_verts, memory_format=torch.contiguous_format)
 
 
 def _remember(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
-    ctx.save_for_backward(inputs[0], inputs[1], inputs[2], inputs[3], *output)
+    ctx.save_for_backward(*inputs[:4], *output)
     ctx.settings = inputs[6:8]
     ctx.mark_non_differentiable(output[1])
 
 
 def _gradient(ctx, grad_survival, _):  # type: ignore[no-untyped-def]
-    face_verts, first_face, num_faces, neighbor, survival, boxes = ctx.saved_tensors
-    grad = numba_cpu.backward(
-        face_verts.detach().contiguous().numpy(), boxes.numpy(), first_face.numpy(), num_faces.numpy(),
-        _neighbor_array(face_verts, neighbor), *ctx.settings, (grad_survival * survival).contiguous().numpy(),
-    )  # fmt: skip
-    return torch.from_numpy(grad), *[None] * 8
+    *faces, survival, boxes = ctx.saved_tensors
+    return _gradient_on_cpu(*faces, boxes, *ctx.settings, grad_survival * survival), *[None] * 8
 
 
 _survival_on_cpu.register_autograd(_gradient, setup_context=_remember)
