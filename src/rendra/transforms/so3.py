@@ -86,7 +86,7 @@ def so3_log_map(R: Tensor, eps: float = 0.0001, cos_bound: float = 1e-4) -> Tens
 
 
 def hat(v: Tensor) -> Tensor:
-    """Skew-symmetric matrices (..., 3, 3) of vectors (..., 3), for which hat(v) u = v × u.
+    """Skew-symmetric matrices (..., 3, 3) of vectors (..., 3): the cross product v × u is `hat` of v times u.
 
     Raises:
         ValueError: if the vectors do not have three coordinates.
