@@ -16,17 +16,13 @@ def rows_from_lists(verts: Sequence[Tensor], faces: Sequence[Tensor]) -> tuple[R
         ValueError: lengths, shapes or devices do not fit together, or a face names no vertex.
     """
     if len(verts) != len(faces):
-        raise ValueError(
-            f"verts and faces must have one entry for each mesh, got {len(verts)} and {len(faces)}"
-        )
+        raise ValueError(f"verts and faces must have one entry for each mesh, got {len(verts)} and {len(faces)}")
     vert_items = [_rows_of_three(v, f"verts[{i}]") for i, v in enumerate(verts)]
     face_items = [_rows_of_three(f, f"faces[{i}]").to(torch.int64) for i, f in enumerate(faces)]
     devices = {str(t.device) for t in [*vert_items, *face_items]}
     if len(devices) > 1:
         raise ValueError(f"All Verts and Faces tensors should be on same device, got {sorted(devices)}")
-    face_items = [
-        _checked_faces(f, len(v), i) for i, (v, f) in enumerate(zip(vert_items, face_items, strict=True))
-    ]
+    face_items = [_checked_faces(f, len(v), i) for i, (v, f) in enumerate(zip(vert_items, face_items, strict=True))]
     like_verts = vert_items[0] if vert_items else torch.zeros(0, 3)
     like_faces = face_items[0] if face_items else torch.zeros(0, 3, dtype=torch.int64)
     return Ragged.from_list(vert_items, like_verts), Ragged.from_list(face_items, like_faces, pad_value=-1)

@@ -88,7 +88,7 @@ class Meshes:
     ) -> "Meshes":
         """Meshes of this class from parts that are known to fit."""
         new = self.__class__.__new__(self.__class__)
-        new._set(verts, topology or self._topology, normals)
+        new._set(verts, self._topology if topology is None else topology, normals)
         new._textures = textures
         return new
 
@@ -122,9 +122,7 @@ class Meshes:
     def textures(self, textures: Any) -> None:
         if textures is not None:
             if not hasattr(textures, "sample_textures") or not hasattr(textures, "check_shapes"):
-                raise ValueError(
-                    f"Expected textures to be an instance of type TexturesBase; got {type(textures)}"
-                )
+                raise ValueError(f"Expected textures to be an instance of type TexturesBase; got {type(textures)}")
             verts, faces = self._topology.verts, self._topology.faces.lengths
             if not textures.check_shapes(len(self), verts.padded_size, faces.padded_size):
                 raise ValueError(
@@ -399,9 +397,7 @@ class Meshes:
         """
         if isinstance(scale, Tensor) and scale.numel() != 1:
             if scale.shape != (len(self),):
-                raise ValueError(
-                    f"scale must be a number or have shape ({len(self)},), got {tuple(scale.shape)}"
-                )
+                raise ValueError(f"scale must be a number or have shape ({len(self)},), got {tuple(scale.shape)}")
             scale = scale[self.verts_packed_to_mesh_idx(), None]
         scaled = Ragged(self._topology.verts, packed=self.verts_packed() * scale)
         return self._replaced(scaled, None, self._normals, self.textures)
@@ -454,9 +450,7 @@ class Meshes:
         if not all(isinstance(size, int) and size >= 0 for size in split_sizes):
             raise ValueError(f"Value of split_sizes must be a list of integers, got {split_sizes}")
         if sum(split_sizes) != len(self):
-            raise ValueError(
-                f"split_sizes must sum to the {len(self)} meshes of the batch, got {split_sizes}"
-            )
+            raise ValueError(f"split_sizes must sum to the {len(self)} meshes of the batch, got {split_sizes}")
         starts = [sum(split_sizes[:i]) for i in range(len(split_sizes))]
         return [self[start : start + size] for start, size in zip(starts, split_sizes, strict=True)]
 
@@ -525,9 +519,7 @@ def join_meshes_as_batch(meshes: Sequence[Meshes], include_textures: bool = True
     if isinstance(meshes, Meshes) or not meshes or not all(isinstance(m, Meshes) for m in meshes):
         raise ValueError("Wrong first argument to join_meshes_as_batch: expected a non-empty list of Meshes")
     if len({m.device for m in meshes}) > 1:
-        raise ValueError(
-            f"All meshes must be on the same device, got {sorted({str(m.device) for m in meshes})}"
-        )
+        raise ValueError(f"All meshes must be on the same device, got {sorted({str(m.device) for m in meshes})}")
     verts = [v for m in meshes for v in m.verts_list()]
     faces = [f for m in meshes for f in m.faces_list()]
     normals = None

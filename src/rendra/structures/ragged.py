@@ -122,7 +122,9 @@ class Ragged:
         """One tensor an item. N of (M_i, ...)"""
         if self._items is not None:
             return list(self._items)
-        return list(self._keep("_items", list(self.packed().split(self.lengths.sizes)) if len(self) else []))
+        if len(self) == 0:
+            return []
+        return list(self._keep("_items", list(self.packed().split(self.lengths.sizes))))
 
     def _keep(self, form: str, value: Any) -> Any:
         if not self.trainable:
@@ -171,9 +173,7 @@ def batch_indices(index: Any, size: int) -> list[int]:
                 f"index must be a 1-D tensor of integers or booleans, got {index.dtype} {tuple(index.shape)}"
             )
         if index.dtype == torch.bool and index.numel() != size:
-            raise IndexError(
-                f"a boolean index needs one entry for each of the {size} items, got {index.numel()}"
-            )
+            raise IndexError(f"a boolean index needs one entry for each of the {size} items, got {index.numel()}")
         index = index.nonzero()[:, 0].tolist() if index.dtype == torch.bool else index.tolist()
     picked = [index] if isinstance(index, int) else index
     if not isinstance(picked, list) or not all(isinstance(i, int) for i in picked):

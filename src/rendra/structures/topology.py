@@ -33,9 +33,7 @@ def uniform_laplacian(num_verts: int, edges: Tensor, dtype: torch.dtype = torch.
     columns = torch.cat([target, diagonal])
     values = torch.cat([degree.reciprocal()[source], degree.new_full((num_verts,), -1.0)])
     size = (num_verts, num_verts)
-    return torch.sparse_coo_tensor(
-        torch.stack([rows, columns]), values, size, check_invariants=False
-    ).coalesce()
+    return torch.sparse_coo_tensor(torch.stack([rows, columns]), values, size, check_invariants=False).coalesce()
 
 
 class Topology:

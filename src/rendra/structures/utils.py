@@ -42,28 +42,22 @@ def list_to_padded(
     largest = [max(item.shape[d] for item in items) for d in range(ndim)]
     size = list(largest if pad_size is None else pad_size)
     if len(size) != ndim:
-        raise ValueError(
-            f"pad_size must contain a target size for each of the {ndim} dimensions, got {tuple(size)}"
-        )
+        raise ValueError(f"pad_size must contain a target size for each of the {ndim} dimensions, got {tuple(size)}")
     if any(given < needed for given, needed in zip(size, largest, strict=True)):
         raise ValueError(f"pad_size {tuple(size)} is smaller than the largest item {tuple(largest)}")
     padded = items[0].new_full((len(items), *size), pad_value)
-    for row, item in zip(padded, items, strict=True):
-        row[tuple(slice(0, s) for s in item.shape)] = item
+    for i, item in enumerate(items):
+        padded[i][tuple(slice(0, s) for s in item.shape)] = item
     return padded
 
 
 def _empty_like(item: Tensor, ndim: int) -> Tensor:
     if item.numel():
-        raise ValueError(
-            f"all tensors must have the same number of dimensions, got {item.ndim} beside {ndim}"
-        )
+        raise ValueError(f"all tensors must have the same number of dimensions, got {item.ndim} beside {ndim}")
     return item.new_zeros((0,) * ndim)
 
 
-def padded_to_list(
-    x: Tensor, split_size: Sequence[int] | Sequence[Sequence[int]] | None = None
-) -> list[Tensor]:
+def padded_to_list(x: Tensor, split_size: Sequence[int] | Sequence[Sequence[int]] | None = None) -> list[Tensor]:
     """
     Cut the padding off.
 
@@ -82,9 +76,7 @@ def padded_to_list(
     if split_size is None:
         return items
     if len(split_size) != len(items):
-        raise ValueError(
-            f"split_size must have one entry for each of the {len(items)} items, got {len(split_size)}"
-        )
+        raise ValueError(f"split_size must have one entry for each of the {len(items)} items, got {len(split_size)}")
     sizes = [(s,) if isinstance(s, int) else tuple(s) for s in split_size]
     return [item[tuple(slice(0, n) for n in s)] for item, s in zip(items, sizes, strict=True)]
 
