@@ -215,9 +215,12 @@ def test_the_operator_is_well_registered():
     torch.library.opcheck(torch.ops.rendra.rasterize_meshes.default, arguments, test_utils=checks)
 
 
+@pytest.mark.filterwarnings("ignore")  # of torch.compile itself
 def test_the_operator_compiles():
+    first, num = packed(8)
+
     def loss(faces):
-        outputs = draw(faces, size=(6, 5), blur=0.01, layers=2)
+        outputs = torch.ops.rendra.rasterize_meshes(faces, first, num, None, 6, 5, 0.01, 2, True, True, False)
         return outputs[1].sum() + outputs[3].square().sum()
 
     eager, compiled = soup(8).requires_grad_(), soup(8).requires_grad_()
