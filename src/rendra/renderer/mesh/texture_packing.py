@@ -120,9 +120,7 @@ def _box_of(image: Tensor, uvs: Tensor, sampling: Sampling) -> _Box:
             f"got {low.tolist()} to {high.tolist()}; keep the meshes as a batch instead"
         )
     (left, bottom), (right, top) = sampling.texels(torch.stack([low, high]), height, width).tolist()
-    return _Box(
-        min(0, floor(left)), max(width, ceil(right) + 1), min(0, floor(top)), max(height, ceil(bottom) + 1)
-    )
+    return _Box(min(0, floor(left)), max(width, ceil(right) + 1), min(0, floor(top)), max(height, ceil(bottom) + 1))
 
 
 def _padded_map(image: Tensor, box: _Box, sampling: Sampling) -> Tensor:
@@ -131,9 +129,7 @@ def _padded_map(image: Tensor, box: _Box, sampling: Sampling) -> Tensor:
     columns = torch.arange(box.left, box.right, device=image.device)
     height, width = image.shape[:2]
     if sampling.padding_mode == "reflection":
-        rows, columns = (
-            _reflected(i, n, sampling.align_corners) for i, n in ((rows, height), (columns, width))
-        )
+        rows, columns = (_reflected(i, n, sampling.align_corners) for i, n in ((rows, height), (columns, width)))
     piece = image[rows.clamp(0, height - 1)][:, columns.clamp(0, width - 1)]
     if sampling.padding_mode == "zeros":
         inside_rows, inside_columns = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)

@@ -34,9 +34,7 @@ class Hits:
         return dense.index_copy(0, self.slots, values).view(*self.shape, values.shape[1])
 
 
-def rows_of(
-    value: Sequence[Tensor] | Tensor, name: str, row: tuple[int | str, ...], pad_value: float = 0
-) -> Ragged:
+def rows_of(value: Sequence[Tensor] | Tensor, name: str, row: tuple[int | str, ...], pad_value: float = 0) -> Ragged:
     """Rows given as N tensors (M_i, *row) or as one (N, M, *row); letters in `row` stand for any size.
 
     Raises:
@@ -54,20 +52,14 @@ def rows_of(
     if len({item.shape[1:] for item in value}) > 1:
         raise ValueError(f"{name} must have rows of one shape, got {[tuple(item.shape) for item in value]}")
     empty_row = [size if isinstance(size, int) else 1 for size in row]
-    like = (
-        value[0]
-        if value
-        else torch.zeros(0, *empty_row, dtype=torch.float32 if pad_value == 0 else torch.int64)
-    )
+    like = value[0] if value else torch.zeros(0, *empty_row, dtype=torch.float32 if pad_value == 0 else torch.int64)
     return Ragged.from_list(value, like, pad_value)
 
 
 def _check_row(value: Any, name: str, row: tuple[int | str, ...], expected: str, leading: int) -> None:
     shape = tuple(value.shape) if isinstance(value, Tensor) else type(value)
     fits = isinstance(value, Tensor) and value.ndim == leading + len(row)
-    if not fits or any(
-        isinstance(n, int) and n != m for n, m in zip(row, value.shape[leading:], strict=True)
-    ):
+    if not fits or any(isinstance(n, int) and n != m for n, m in zip(row, value.shape[leading:], strict=True)):
         raise ValueError(f"{name} must be a tensor {expected}, got {shape}")
 
 
@@ -80,9 +72,7 @@ def checked_maps(maps: Sequence[Tensor] | Tensor, expected: str) -> list[Tensor]
     ndim = expected.count(",") + 1
     if isinstance(maps, Tensor):
         if maps.ndim != ndim + 1 or not maps.is_floating_point():
-            raise ValueError(
-                f"maps must be floating point (N, {expected[1:]}, got {maps.dtype} {tuple(maps.shape)}"
-            )
+            raise ValueError(f"maps must be floating point (N, {expected[1:]}, got {maps.dtype} {tuple(maps.shape)}")
         return maps
     if not isinstance(maps, (list, tuple)):
         raise ValueError(f"maps must be a list of tensors or a tensor, got {type(maps)}")
@@ -119,9 +109,7 @@ def fit_rows(rows: Ragged, lengths: Lengths, name: str) -> Ragged:
 
 def picked(rows: Ragged, ids_list: SubmeshIds) -> Ragged:
     """For each item, the rows of each of its submeshes."""
-    chosen = [
-        own[ids] for own, ids_of_item in zip(rows.items(), ids_list, strict=True) for ids in ids_of_item
-    ]
+    chosen = [own[ids] for own, ids_of_item in zip(rows.items(), ids_list, strict=True) for ids in ids_of_item]
     return Ragged.from_list(chosen, rows.packed(), rows.pad_value)
 
 
@@ -133,12 +121,8 @@ def concatenated(parts: list[Any]) -> Ragged:
     """
     first: Ragged = parts[0]
     if len({part.packed().shape[1:] for part in parts}) > 1:
-        raise ValueError(
-            f"textures must have equal shapes, got {[tuple(part.packed().shape) for part in parts]}"
-        )
-    return Ragged.from_list(
-        [item for part in parts for item in part.items()], first.packed(), first.pad_value
-    )
+        raise ValueError(f"textures must have equal shapes, got {[tuple(part.packed().shape) for part in parts]}")
+    return Ragged.from_list([item for part in parts for item in part.items()], first.packed(), first.pad_value)
 
 
 def as_one_item(rows: Ragged) -> Ragged:

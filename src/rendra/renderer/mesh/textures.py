@@ -363,8 +363,7 @@ class TexturesUV(TexturesBase):
         for i, (faces, verts) in enumerate(zip(self.faces_uvs_list(), self.verts_uvs_list(), strict=True)):
             if faces.numel() and int(faces.max()) >= len(verts):
                 raise ValueError(
-                    f"faces_uvs[{i}] refers to row {int(faces.max())}, "
-                    f"but verts_uvs[{i}] has {len(verts)} rows"
+                    f"faces_uvs[{i}] refers to row {int(faces.max())}, but verts_uvs[{i}] has {len(verts)} rows"
                 )
         if self._maps_ids is None:
             return
@@ -374,9 +373,7 @@ class TexturesUV(TexturesBase):
             if ids.numel() and not 0 <= int(ids.min()) <= int(ids.max()) < len(maps):
                 raise ValueError(f"maps_ids[{i}] must lie in [0, {len(maps)})")
 
-    def _with(
-        self, maps: list[Tensor] | Tensor, faces: Ragged, verts: Ragged, ids: Ragged | None
-    ) -> "TexturesUV":
+    def _with(self, maps: list[Tensor] | Tensor, faces: Ragged, verts: Ragged, ids: Ragged | None) -> "TexturesUV":
         new = self.__class__.__new__(self.__class__)
         new.padding_mode, new.align_corners = self.padding_mode, self.align_corners
         new.sampling_mode = self.sampling_mode
@@ -567,9 +564,7 @@ class TexturesUV(TexturesBase):
             NotImplementedError: a mesh has several maps.
         """
         if self.multi_map:
-            raise NotImplementedError(
-                "join_scene needs one map a mesh, these textures have several (maps_ids)"
-            )
+            raise NotImplementedError("join_scene needs one map a mesh, these textures have several (maps_ids)")
         faces, verts = as_one_item(self._faces_uvs), as_one_item(self._verts_uvs)
         if len(self) == 0:
             return self._with(self.maps_padded().new_zeros(1, 1, 1, 3), faces, verts, None)
