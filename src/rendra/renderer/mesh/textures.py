@@ -265,7 +265,8 @@ class TexturesAtlas(TexturesBase):
         hits = Hits(fragments)
         atlas = self.atlas_packed()
         size = atlas.shape[1]
-        scaled = hits.bary.detach()[:, :2] * size
+        inside = hits.bary.detach().clamp_min(0)  # blurred edges reach beyond the face
+        scaled = inside[:, :2] / inside.sum(1, keepdim=True) * size
         cell = scaled.long().clamp(0, size - 1)  # (M, 2) as column, row
         beyond_diagonal = scaled.sum(1) - cell.sum(1) > 1
         column, row = torch.where(beyond_diagonal[:, None], size - 1 - cell, cell).unbind(1)
