@@ -7,7 +7,6 @@ two lines. Positions are byte offsets; rows are counted from 0, file lines from 
 import re
 import warnings
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -37,20 +36,15 @@ class Lines:
         self.name, self._first_number = name, first_number
         if b"\r" in data and b"\n" not in data:
             data = data.replace(b"\r", b"\n")
-        self.data = data + b"\n\n\n"  # so that the two characters after any first one can be looked at
         self._file_breaks: Positions | None = None
-        if continued and (b"\\\n" in self.data or b"\\\r\n" in self.data):
-            self._file_breaks = np.flatnonzero(self.chars == _NEWLINE)
-            self.data = _join_continued(self.data)
-            del self.chars
+        if continued and (b"\\\n" in data or b"\\\r\n" in data):
+            self._file_breaks = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == _NEWLINE)
+            data = _join_continued(data)
+        self.data = data + b"\n\n\n"  # so that the two characters after any first one can be looked at
+        self.chars = np.frombuffer(self.data, dtype=np.uint8)
         self.ends: Positions = np.flatnonzero(self.chars == _NEWLINE)[:-2]
         self.starts: Positions = np.concatenate([[0], self.ends[:-1] + 1])
         self.firsts = self._first_characters()
-
-    @cached_property
-    def chars(self) -> npt.NDArray[np.uint8]:
-        """The text as codes."""
-        return np.frombuffer(self.data, dtype=np.uint8)
 
     def _first_characters(self) -> Positions:
         """Offset of each line's first character that is not blank; its end where all are."""

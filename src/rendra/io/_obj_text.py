@@ -245,7 +245,8 @@ def _resolve(corners: _Corners, slot: int, defined_rows: Positions, noun: str) -
     if bad.any():
         corner = int(bad.argmax())
         reach = f"an index from 1 to {total}, or negative within what stands above" if total else f"no {noun} index"
-        why = f"a face names {noun} {raw[corner]}, but the file has {total}"
+        written = corners.block.token(corner).decode("latin-1").split("/")[slot]
+        why = f"a face names {noun} {written[:24]}, but the file has {total}"
         corners.block.fail_token(corner, why, reach)
     return index  # absent ones were read as 0, so they are -1 already
 

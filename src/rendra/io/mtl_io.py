@@ -166,7 +166,7 @@ def _texture_name(rest: bytes, source: Source, line: int) -> str:
     words = rest.split()
     while words and words[0] in _MAP_OPTIONS:
         option, taken = words[0], 1
-        while taken <= _MAP_OPTIONS[option] and len(words) > taken + 1:
+        while taken <= _MAP_OPTIONS[option] and len(words) > taken:
             if option in _VECTOR_OPTIONS and not _is_number(words[taken]):
                 break
             taken += 1

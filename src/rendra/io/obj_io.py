@@ -407,7 +407,7 @@ class _Text:
             sections.append(self._floats("vn", self._normals[0]))
             corners.append(self._normals[1])
             corner += "/%d" if self._uvs is not None else "//%d"
-        indices = np.stack(corners, axis=-1).reshape(len(self._faces), -1) + 1
+        indices = np.stack(corners, axis=-1).reshape(len(self._faces), 3 * len(corners)) + 1
         sections.append(format_rows(f"f {corner} {corner} {corner}\n", indices))
         return b"".join(sections)
 
