@@ -27,7 +27,12 @@ from rendra.renderer.blending import (
 from rendra.renderer.lighting import PointLights
 from rendra.renderer.materials import Materials
 from rendra.renderer.mesh.rasterizer import Fragments, cameras_for_call
-from rendra.renderer.mesh.shading import flat_shading, gouraud_shading, phong_shading, surface_points
+from rendra.renderer.mesh.shading import (
+    flat_shading,
+    gouraud_shading,
+    phong_shading,
+    phong_shading_with_points,
+)
 from rendra.renderer.splatter_blend import SplatterBlender
 from rendra.structures.meshes import Meshes
 
@@ -218,18 +223,14 @@ class SplatterPhongShader(ShaderBase):
         scene = self._scene(kwargs)
         blend_params = self._blending(kwargs)
         self.check_blend_params(blend_params)
-        colors = phong_shading(meshes, fragments, texels=meshes.sample_textures(fragments), **scene)
-        slots, points, _ = surface_points(meshes, fragments)
-        shape = fragments.pix_to_face.shape
-        if self.splatter_blender is None or self.splatter_blender.input_shape != shape:
-            self.splatter_blender = SplatterBlender((shape[0], shape[1], shape[2], shape[3]), colors.device)
-        return self.splatter_blender(
-            colors,
-            slots.put(points).view(*shape, 3),
-            scene["cameras"],
-            fragments.pix_to_face < 0,
-            blend_params,
-        )
+        samples = fragments.detach()  # fixed on the surface: they move with it, not with the pixel grid
+        texels = meshes.sample_textures(samples)
+        colors, points = phong_shading_with_points(meshes, samples, texels=texels, **scene)
+        n, h, w, k = samples.pix_to_face.shape
+        if self.splatter_blender is None or self.splatter_blender.input_shape != (n, h, w, k):
+            self.splatter_blender = SplatterBlender((n, h, w, k), colors.device)
+        empty = samples.pix_to_face < 0
+        return self.splatter_blender(colors, points, scene["cameras"], empty, blend_params)
 
     @staticmethod
     def check_blend_params(blend_params: BlendParams) -> None:

@@ -33,10 +33,17 @@ def phong_shading(
     Returns:
         (N, H, W, K, C); zero in empty slots, which cost nothing.
     """
-    slots, points, normals = surface_points(meshes, fragments)
-    tint, highlight = _light_rows(points, normals, slots.counts, lights, cameras, materials)
-    colors = slots.take(texels.flatten(1, 3)) * tint + highlight
+    slots, colors, _ = _phong_rows(meshes, fragments, lights, cameras, materials, texels)
     return slots.put(colors).view(*fragments.pix_to_face.shape, colors.shape[-1])
+
+
+def phong_shading_with_points(
+    meshes: Meshes, fragments: Any, lights: Any, cameras: Any, materials: Materials, texels: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`phong_shading`, and the surface points themselves: (N, H, W, K, 3) in world coordinates, zero where empty."""
+    slots, colors, points = _phong_rows(meshes, fragments, lights, cameras, materials, texels)
+    shape = fragments.pix_to_face.shape
+    return slots.put(colors).view(*shape, colors.shape[-1]), slots.put(points).view(*shape, 3)
 
 
 def gouraud_shading(meshes: Meshes, fragments: Any, lights: Any, cameras: Any, materials: Materials) -> Tensor:
@@ -82,19 +89,16 @@ def flat_shading(
     return slots.put(colors).view(*fragments.pix_to_face.shape, colors.shape[-1])
 
 
-def surface_points(meshes: Meshes, fragments: Any) -> tuple[Compaction, Tensor, Tensor]:
-    """Positions and normals at the filled slots of fragments.
-
-    Returns:
-        slots: where among the (N, H * W * K) slots the M rows belong.
-        points: (M, 3) in world coordinates.
-        normals: (M, 3), interpolated, not of unit length.
-    """
+def _phong_rows(
+    meshes: Meshes, fragments: Any, lights: Any, cameras: Any, materials: Materials, texels: Tensor
+) -> tuple[Compaction, Tensor, Tensor]:
+    """Phong's colours (M, C) and the positions (M, 3) of the M filled slots, and which slots these are."""
     slots, faces = _filled_slots(fragments)
     bary = slots.take(fragments.bary_coords.flatten(1, 3))
     corners = _at_corners(torch.cat((meshes.verts_packed(), meshes.verts_normals_packed()), dim=1), meshes)
     points, normals = interpolate_face_attributes(faces, bary, corners).split(3, dim=-1)
-    return slots, points, normals
+    tint, highlight = _light_rows(points, normals, slots.counts, lights, cameras, materials)
+    return slots, slots.take(texels.flatten(1, 3)) * tint + highlight, points
 
 
 def _filled_slots(fragments: Any) -> tuple[Compaction, Tensor]:

@@ -178,7 +178,8 @@ def test_faces_that_reach_behind_the_camera_are_not_culled_by_turned_signs() -> 
 
 def _ground(near: float, far: float, dtype: torch.dtype = torch.float32) -> Meshes:
     """A ground plane one unit below the camera, from depth `near` to `far`, in NDC of focal length 1."""
-    corners = torch.tensor([[-1.0, -1, near], [1, -1, near], [1, -1, far], [-1, -1, far]], dtype=dtype)
+    x = HALF_WIDTH
+    corners = torch.tensor([[-x, -1, near], [x, -1, near], [x, -1, far], [-x, -1, far]], dtype=dtype)
     return Meshes([project(corners, True)], [torch.tensor([[0, 1, 2], [0, 2, 3]])])
 
 
