@@ -134,7 +134,7 @@ class CamerasBase(TensorProperties):
         chosen = self._check_index(index)
         fields: dict[str, Any] = {}
         for name in self._FIELDS:
-            value = getattr(self, name, None)
+            value: Any = getattr(self, name, None)
             batched = isinstance(value, Tensor) and name not in self._SHARED_FIELDS
             fields[name.lstrip("_")] = value[chosen] if batched else value
         return type(self)(**fields, device=self.device)

@@ -230,7 +230,10 @@ class FoVOrthographicCameras(_FoVCameras):
     def compute_projection_matrix(
         self, znear: Any, zfar: Any, max_x: Any, min_x: Any, max_y: Any, min_y: Any, scale_xyz: Any
     ) -> Tensor:
-        """K (N, 4, 4) of numbers or tensors: the box to [-1, 1]² x [0, 1], each axis times its scale."""
+        """K (N, 4, 4) of numbers or tensors: the box to [-1, 1]² x [0, 1].
+
+        As PyTorch3D has it, `scale_xyz` multiplies the factors and leaves the shifts alone.
+        """
         near, far, right, left, top, bottom, scale = _columns(
             self, znear, zfar, max_x, min_x, max_y, min_y, scale_xyz
         )

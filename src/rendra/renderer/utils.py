@@ -180,16 +180,15 @@ def parse_image_size(image_size: int | Sequence[int]) -> tuple[int, int]:
     Raises:
         ValueError: unless it is one or two positive integers.
     """
-    if not isinstance(image_size, (tuple, list)):
-        image_size = (image_size, image_size)  # type: ignore[assignment]
-    if len(image_size) != 2:
+    size = tuple(image_size) if isinstance(image_size, (tuple, list)) else (image_size, image_size)
+    if len(size) != 2:
         raise ValueError(f"Image size can only be a tuple/list of (H, W); got {image_size}")
-    height, width = image_size
-    if not all(isinstance(size, (int, np.integer)) for size in image_size):
-        raise ValueError(f"Image sizes must be integers; got {height}, {width}")
+    if not all(isinstance(side, (int, np.integer)) for side in size):
+        raise ValueError(f"Image sizes must be integers; got {size[0]}, {size[1]}")
+    height, width = int(size[0]), int(size[1])
     if height <= 0 or width <= 0:
         raise ValueError(f"Image sizes must be greater than 0; got {height}, {width}")
-    return int(height), int(width)
+    return height, width
 
 
 def ndc_grid_sample(

@@ -1,6 +1,7 @@
-"""Shapes to start from."""
+"""Shapes to start from, and OpenCV's cameras."""
 
+from rendra.utils.camera_conversions import cameras_from_opencv_projection, opencv_from_cameras_projection
 from rendra.utils.ico_sphere import ico_sphere
 from rendra.utils.torus import torus
 
-__all__ = ["ico_sphere", "torus"]
+__all__ = ["cameras_from_opencv_projection", "ico_sphere", "opencv_from_cameras_projection", "torus"]
