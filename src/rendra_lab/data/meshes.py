@@ -1,0 +1,139 @@
+"""The meshes that tasks and scripts start from: made here, or read from the user's file."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rendra.io import IO, load_objs_as_meshes
+from rendra.renderer.mesh.textures import TexturesVertex
+from rendra.structures.meshes import Meshes
+from rendra.utils.ico_sphere import ico_sphere
+from rendra.utils.torus import torus
+from rendra_lab.synthesis.cow import CoatParameters, CowParameters, make_cow
+
+Device = torch.device | str
+NORMALIZATIONS = ("center", "extent", "max_abs")
+
+
+def load_mesh(
+    name: str = "cow",
+    path: str | Path | None = None,
+    normalize: str | None = None,
+    size: float = 2.0,
+    device: Device = "cpu",
+    **options: Any,
+) -> Meshes:
+    """One mesh with a texture: a file if `path` is given, else one of our own.
+
+    Args:
+        name: cow, ico_sphere, torus or cube; ignored where there is a path.
+        path: an OBJ or PLY file, or whatever else `rendra.io.IO` reads.
+        normalize: None leaves the vertices where they are. `center` moves the middle of the bounding box to
+            the origin; `extent` also scales the longest side of the box to `size`. `max_abs` subtracts the
+            mean of the vertices and scales their largest coordinate to `size` / 2.
+        size: of the normalised mesh.
+        device: where the mesh goes.
+        **options: of our own meshes, ignored where there is a path. cow: seed, texture_size, num_faces, breed,
+            build (a mapping of CowParameters' fields). ico_sphere: level. torus: r, R, sides, rings.
+
+    Returns:
+        A batch of one mesh; white vertex colours where the file has none.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: an unknown name, normalisation or option, a malformed file (MeshFormatError) or one without
+            faces.
+    """
+    if normalize not in (None, *NORMALIZATIONS):
+        raise ValueError(f"mesh.normalize must be null or one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
+    if not size > 0:
+        raise ValueError(f"mesh.size must be positive, got {size!r}")
+    mesh = _make(name, options, device) if path is None else _read(Path(path), device)
+    if mesh.textures is None:
+        mesh.textures = TexturesVertex([torch.ones_like(mesh.verts_packed())])
+    return mesh if normalize is None else _normalized(mesh, normalize, size)
+
+
+def bounding_sphere(mesh: Meshes) -> tuple[Tensor, float]:
+    """The middle (3,) of a mesh's bounding box, and the distance of the farthest vertex from it."""
+    verts = mesh.verts_packed().detach()
+    centre = (verts.amin(0) + verts.amax(0)) / 2
+    return centre, float((verts - centre).norm(dim=1).amax())
+
+
+def make_cube(device: Device = "cpu") -> Meshes:
+    """The cube from -1 to 1, without a texture; every side has its own vertices, so that its edges look sharp."""
+    square = torch.tensor([[1.0, -1, -1], [1, 1, -1], [1, 1, 1], [1, -1, 1]])  # counter-clockwise from +x
+    sides = [square.roll(axis, dims=1) for axis in range(3)]
+    sides += [-side.flip(0) for side in sides]
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]]) + 4 * torch.arange(6)[:, None, None]
+    return Meshes([torch.cat(sides).to(device)], [faces.reshape(-1, 3).to(device)])
+
+
+def _read(path: Path, device: Device) -> Meshes:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no mesh file {path}{' (it is a folder)' if path.is_dir() else ''}")
+    is_obj = path.suffix.lower() == ".obj"
+    mesh = load_objs_as_meshes([path], device=device) if is_obj else IO().load_mesh(path, device=device)
+    if not len(mesh.faces_packed()):
+        raise ValueError(f"{path} holds no faces, so there is nothing to see")
+    return mesh
+
+
+def _make(name: str, options: Mapping[str, Any], device: Device) -> Meshes:
+    if name not in _MAKERS:
+        raise ValueError(f"there is no mesh {name!r}; there are {', '.join(_MAKERS)}, or give mesh.path=FILE")
+    try:
+        return _MAKERS[name](device=device, **options)
+    except TypeError as error:
+        raise ValueError(f"mesh {name!r} cannot be made with {dict(options)}: {error}") from error
+
+
+def _cow(
+    device: Device,
+    seed: int = 0,
+    texture_size: int = 512,
+    num_faces: int = 9600,
+    breed: str = "holstein",
+    build: Mapping[str, float] | None = None,
+) -> Meshes:
+    shape, coat = CowParameters(**(build or {})), CoatParameters.of_breed(breed)
+    return make_cow(seed, texture_size, num_faces, build=shape, coat=coat, device=device)
+
+
+def _ico_sphere(device: Device, level: int = 4) -> Meshes:
+    return ico_sphere(level, device)
+
+
+def _torus(device: Device, r: float = 0.4, R: float = 1.0, sides: int = 32, rings: int = 64) -> Meshes:
+    return torus(r, R, sides, rings, device)
+
+
+_MAKERS: dict[str, Callable[..., Meshes]] = {
+    "cow": _cow,
+    "ico_sphere": _ico_sphere,
+    "torus": _torus,
+    "cube": make_cube,
+}
+
+
+def _normalized(mesh: Meshes, how: str, size: float) -> Meshes:
+    verts = mesh.verts_packed()
+    if how == "max_abs":
+        moved = verts - verts.mean(0)
+        scale = size / 2 / _positive(moved.abs().amax())
+        return mesh.update_padded((moved * scale)[None])
+    low, high = verts.amin(0), verts.amax(0)
+    moved = verts - (low + high) / 2
+    if how == "extent":
+        moved = moved * (size / _positive((high - low).amax()))
+    return mesh.update_padded(moved[None])
+
+
+def _positive(extent: Tensor) -> Tensor:
+    if not extent > 0:
+        raise ValueError("the mesh is a single point, so it cannot be scaled: leave mesh.normalize out")
+    return extent
