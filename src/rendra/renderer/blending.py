@@ -146,7 +146,7 @@ def softmax_depth_blend(
 
 def _covered(pix_to_face: Tensor, *layers: Tensor) -> tuple[Tensor, list[Tensor], Compaction]:
     """Bring (N, H, W, K, ...) layers to the pixels (P, K, ...) that hold a face, and the mask of their slots."""
-    covered = Compaction((pix_to_face >= 0).any(-1).flatten(1))
+    covered = Compaction((pix_to_face.amax(-1) >= 0).flatten(1))
     mask = covered.take(pix_to_face.flatten(1, 2)) >= 0
     return mask, [covered.take(layer.flatten(1, 2)) for layer in layers], covered
 

@@ -311,7 +311,7 @@ def _on_covered_pixels(
 ) -> Tensor:
     """Run `render` on the covered pixels, fragments (N, 1, P, K); write its (N, 1, P, C + 1) over the background."""
     height, width = fragments.pix_to_face.shape[1:3]
-    pixels = _Gathered((fragments.pix_to_face >= 0).any(-1).flatten(1))
+    pixels = _Gathered((fragments.pix_to_face.amax(-1) >= 0).flatten(1))
     seen = _each(fragments, lambda x: pixels.gather(x.flatten(1, 2), -1)[:, None])
     result = render(_drop_empty_layers(seen))[:, 0]
     background = background_color(blend_params, result[..., :-1])

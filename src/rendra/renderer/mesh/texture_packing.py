@@ -6,10 +6,12 @@ as its texture coordinates reach, so that interpolation never meets a neighbour'
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, floor, isqrt
+from math import ceil, floor
 
 import torch
 from torch import Tensor
+
+from rendra.renderer.mesh.utils import pack_rectangles
 
 _MAX_OVERHANG = 2  # how many widths of a map its coordinates may lie outside of it
 
@@ -97,10 +99,11 @@ def pack_maps(images: Sequence[Tensor], uvs: Sequence[Tensor], sampling: Samplin
     for image, own in zip(images, uvs, strict=True):
         box = _box_of(image, own, sampling)
         boxes[id(image)] = boxes.get(id(image), box) | box
-    corners, size = _pack_rectangles([(b.bottom - b.top, b.right - b.left) for b in boxes.values()])
-    canvas = images[0].new_zeros(*size, images[0].shape[-1])
+    packed = pack_rectangles([(b.right - b.left, b.bottom - b.top) for b in boxes.values()])
+    width, height = packed.total_size
+    canvas = images[0].new_zeros(height, width, images[0].shape[-1])
     shifts = {}
-    for (key, box), (row, column) in zip(boxes.items(), corners, strict=True):
+    for (key, box), (column, row, *_) in zip(boxes.items(), packed.locations, strict=True):
         piece = _padded_map(distinct[key], box, sampling)
         canvas[row : row + piece.shape[0], column : column + piece.shape[1]] = piece
         shifts[key] = (column - box.left, row - box.top)
@@ -142,22 +145,3 @@ def _reflected(index: Tensor, size: int, align_corners: bool) -> Tensor:
     period = max(2 * (size - 1), 1) if align_corners else 2 * size
     turned = index.remainder(period)
     return torch.minimum(turned, period - turned - (0 if align_corners else 1))
-
-
-def _pack_rectangles(sizes: Sequence[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Place rectangles (height, width) on shelves, tallest first, in an area that is about square.
-
-    Returns:
-        The top left corner (row, column) of each, and the height and width that all need.
-    """
-    limit = max(max(width for _, width in sizes), isqrt(sum(h * w for h, w in sizes)))
-    corners = [(0, 0)] * len(sizes)
-    row = column = shelf = used = 0
-    for i in sorted(range(len(sizes)), key=lambda i: -sizes[i][0]):
-        height, width = sizes[i]
-        if column and column + width > limit:
-            row, column, shelf = row + shelf, 0, 0
-        corners[i] = (row, column)
-        column, shelf = column + width, max(shelf, height)
-        used = max(used, column)
-    return corners, (row + shelf, used)

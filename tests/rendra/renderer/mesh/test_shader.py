@@ -220,7 +220,7 @@ def test_gradients_to_colours_and_light_by_finite_differences(shader: type) -> N
 
     place = torch.tensor([[2.0, 3.0, 2.0]], dtype=torch.float64, requires_grad=True)
     inputs = (verts.clone().requires_grad_(), torch.rand_like(verts).requires_grad_(), place)
-    assert torch.autograd.gradcheck(render, inputs, rtol=1e-3, atol=1e-5)
+    assert torch.autograd.gradcheck(render, inputs, rtol=1e-3, atol=1e-5, fast_mode=True)
 
 
 @pytest.mark.parametrize("shader", RGBA)
