@@ -21,6 +21,7 @@ from rendra.common.datatypes import Device, get_device, make_device
 from rendra.transforms.se3 import affine_matrix, se3_log_map
 
 _Index: TypeAlias = int | list[int] | slice | Tensor
+_SINGLE_THREADED_POINTS = 32768 // 4  # torch's grain size, over the four coordinates of a point
 
 
 class Transform3d:
@@ -41,9 +42,7 @@ class Transform3d:
         if matrix is None:
             matrix = torch.eye(4, dtype=dtype, device=device)
         elif matrix.dim() not in (2, 3):
-            raise ValueError(
-                f'"matrix" has to be a 2- or a 3-dimensional tensor; got shape {tuple(matrix.shape)}'
-            )
+            raise ValueError(f'"matrix" has to be a 2- or a 3-dimensional tensor; got shape {tuple(matrix.shape)}')
         elif matrix.shape[-2:] != (4, 4):
             raise ValueError(
                 f'"matrix" has to be a tensor of shape (minibatch, 4, 4) or (4, 4); got {tuple(matrix.shape)}'
@@ -128,7 +127,7 @@ class Transform3d:
         batch = _as_batch(points, "points")
         matrix = self._matrix.to(points.dtype)
         _check_batches(batch, matrix)
-        homogeneous = matrix[:, 3:] + batch @ matrix[:, :3]  # (N, P, 4)
+        homogeneous = _times(batch, matrix)
         w = homogeneous[..., 3:]
         if eps is not None:
             w = torch.where(w < 0, w.clamp(max=-eps), w.clamp(min=eps))
@@ -347,12 +346,23 @@ def _multiply(a: Tensor, b: Tensor) -> Tensor:
     return a @ b
 
 
+def _times(points: Tensor, matrix: Tensor) -> Tensor:
+    """The rows [x, y, z, 1] M (N, P, 4) of points (N, P, 3) and matrices (N, 4, 4), a batch of 1 broadcast.
+
+    Below torch's threshold for threads in elementwise operations, these beat a matrix product, which takes
+    threads at any size and then waits milliseconds for them wherever another process holds the cores.
+    """
+    if points.shape[1] * max(len(points), len(matrix)) > _SINGLE_THREADED_POINTS:
+        return matrix[:, 3:] + points @ matrix[:, :3]
+    x, y, z = points.split(1, dim=-1)
+    out = torch.addcmul(matrix[:, 3:], z, matrix[:, 2:3])
+    return torch.addcmul(torch.addcmul(out, y, matrix[:, 1:2]), x, matrix[:, :1])
+
+
 def _check_batches(a: Tensor, b: Tensor) -> None:
     """Raises ValueError unless the batch sizes are equal or one of them is 1."""
     if a.shape[0] != b.shape[0] and 1 not in (a.shape[0], b.shape[0]):
-        raise ValueError(
-            f"Expected batch dim for bmm to be equal or 1; got {tuple(a.shape)}, {tuple(b.shape)}"
-        )
+        raise ValueError(f"Expected batch dim for bmm to be equal or 1; got {tuple(a.shape)}, {tuple(b.shape)}")
 
 
 def _as_batch(vectors: Tensor, name: str) -> Tensor:
@@ -379,9 +389,7 @@ def _parse_xyz(x: Any, y: Any, z: Any, dtype: torch.dtype | None, device: Device
     columns = [torch.as_tensor(c, dtype=kind, device=target) for c in (x, y, z)]
     shapes = [tuple(c.shape) for c in columns]
     if any(len(shape) > 1 for shape in shapes) or len({c.numel() for c in columns} - {1}) > 1:
-        raise ValueError(
-            f"Expected x, y and z to be numbers or of shape (N,) or (1,); got {shapes} (in {name})"
-        )
+        raise ValueError(f"Expected x, y and z to be numbers or of shape (N,) or (1,); got {shapes} (in {name})")
     return torch.stack(torch.broadcast_tensors(*(c.reshape(-1) for c in columns)), dim=-1)
 
 

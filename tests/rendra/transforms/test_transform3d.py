@@ -122,6 +122,13 @@ def test_normals_stay_perpendicular() -> None:
     assert_close(dot, torch.zeros(3, 6), atol=1e-12)
 
 
+def test_many_points_go_the_same_way_as_few() -> None:
+    transform = some_transforms()["general"]
+    points = torch.randn(20000, 3, dtype=torch.float64)
+    few = torch.cat([transform.transform_points(part) for part in points.split(2000)], dim=1)
+    assert_close(transform.transform_points(points), few, atol=0, rtol=1e-10)
+
+
 def test_dividing_by_small_w_keeps_its_sign() -> None:
     matrix = torch.eye(4)
     matrix[2, 3], matrix[3, 3] = 1, 0  # w = z
