@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from rendra.common.datatypes import Device
 from rendra.renderer.utils import TensorProperties
 from rendra.transforms import Rigid, Transform3d
 from rendra.transforms.se3 import affine_matrix
@@ -37,6 +38,12 @@ class CamerasBase(TensorProperties):
     _SHARED_FIELDS: ClassVar[tuple[str, ...]] = ()
     R: Tensor  # (N, 3, 3)
     T: Tensor  # (N, 3)
+
+    def __init__(self, device: Device = "cpu", **kwargs: Any) -> None:
+        super().__init__(device=device, **kwargs)
+        for name, default in (("R", DEFAULT_R), ("T", DEFAULT_T)):
+            if kwargs.get(name) is default:  # `cameras.T += 1` must not move every other camera
+                setattr(self, name, getattr(self, name).clone())
 
     def get_projection_transform(self, **kwargs: Any) -> Transform3d:
         """The transform from view space to the camera's projected space, if it has the form of a matrix."""

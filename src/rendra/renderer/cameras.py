@@ -102,8 +102,8 @@ class _MatrixCameras(CamerasBase):
     def _pixels_to_ndc(self, K: Tensor, **kwargs: Any) -> tuple[Tensor, Tensor]:
         """Scale and shift (N, 2) from a screen camera's projected x, y to NDC: ndc = scale x + shift.
 
-        The projection f x/z + p has x to the left but p measured from the right side's opposite, the left:
-        the pixel is 2p minus it, hence the -2p.
+        The projection q = f x/z + p has x to the left but p counted from the image's left side, so the pixel
+        is p - f x/z = 2p - q.
         """
         size = image_size_wh(self, kwargs.get("image_size", self.get_image_size())).to(K.dtype)
         principal = K[:, :2, 2 if self.is_perspective() else 3]

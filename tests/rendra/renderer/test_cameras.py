@@ -256,6 +256,14 @@ def test_a_clone_is_equal_and_separate(name: str) -> None:
     assert copy.to("cpu") is copy
 
 
+def test_default_poses_are_not_shared() -> None:
+    first, second = c.PerspectiveCameras(), c.PerspectiveCameras()
+    first.T += 1
+    first.R *= 2
+    assert_close(second.T, torch.zeros(1, 3))
+    assert_close(c.FoVPerspectiveCameras().R, torch.eye(3)[None])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_the_pose(name: str) -> None:
     cameras = made(name)
