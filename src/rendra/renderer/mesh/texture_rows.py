@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from rendra.ops.interp_face_attrs import interpolate_face_attributes
 from rendra.structures.ragged import Lengths, Ragged
 
 SubmeshIds = Sequence[Sequence[Tensor]]
@@ -25,8 +26,7 @@ class Hits:
 
     def interpolate(self, corners: Tensor) -> Tensor:
         """Values (M, C) between those at the corners of all faces (sum F, 3, C)."""
-        own = corners.flatten(1).index_select(0, self.faces).view(-1, *corners.shape[1:])
-        return torch.einsum("mkc,mk->mc", own, self.bary.to(own.dtype))
+        return interpolate_face_attributes(self.faces, self.bary.to(corners.dtype), corners)
 
     def spread(self, values: Tensor) -> Tensor:
         """Values (M, C) in their slots, 0 in the others. (N, H, W, K, C)"""
