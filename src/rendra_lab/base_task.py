@@ -139,7 +139,10 @@ class Task(BaseTask[BatchT, PredictionT]):
 
     def residuals(self, batch: BatchT) -> Tensor:
         """The vector (R,) whose squared length is the objective; TypeError for a term without residuals."""
-        prediction = self.predict(batch)
+        return self.residuals_of(self.predict(batch), batch)
+
+    def residuals_of(self, prediction: PredictionT, batch: BatchT) -> Tensor:
+        """`residuals` of a prediction that is made already."""
         step = self.global_step
         return torch.cat([term.residuals(prediction, batch, step) for _, term in self._weighted()])
 

@@ -158,8 +158,8 @@ class LastStepKeeper(Callback):
         trainer.save_checkpoint(self.path)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves what an ended fit has reached, if it made a step."""
-        if trainer.training and trainer.global_step > self._begun_at:
+        """Saves what an ended fit has reached, if it made a step; alone, as other processes may be gone."""
+        if trainer.world_size == 1 and trainer.training and trainer.global_step > self._begun_at:
             trainer.save_checkpoint(self.path)
 
 

@@ -11,17 +11,19 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities.model_helpers import is_overridden
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from rendra_lab import report
 from rendra_lab.base_task import BaseTask
@@ -116,7 +118,8 @@ def run(cfg: DictConfig) -> float | None:
         checkpoint = find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root))
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
-        record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
+        with _own_processes(experiment):
+            record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
     except BaseException as error:
         log.info("the run failed", exc_info=True)  # the console gets the message alone
         record.update(status="failed", error=f"{type(error).__name__}: {error}"[:2000], seconds=clock.laps())
@@ -280,6 +283,34 @@ def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock
         metrics.update(_numbers(trainer))
         clock.lap("test")
     return metrics
+
+
+@contextmanager
+def _own_processes(experiment: Experiment) -> Iterator[None]:
+    """Distributed processes of one run begin and end with it.
+
+    Lightning starts them with this process's command line. In a sweep that would repeat the whole sweep in each
+    of them; here they get the command of the one job, and its folder.
+    """
+    known = HydraConfig.get() if HydraConfig.initialized() else None
+    arguments, environment = sys.argv, dict(os.environ)
+    if known is not None and known.mode == RunMode.MULTIRUN:
+        hydra_own = [item for item in known.overrides.hydra if not item.startswith("hydra.mode=")]
+        sys.argv = [arguments[0], *known.overrides.task, *hydra_own]
+        with read_write(known):
+            known.run.dir = str(experiment.folder)
+    try:
+        yield
+    finally:
+        sys.argv = arguments
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        for process in getattr(experiment.trainer.strategy.launcher, "procs", []):
+            process.wait(timeout=120)
+        for name in ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE"):
+            os.environ.pop(name, None)
+            if name in environment:
+                os.environ[name] = environment[name]
 
 
 def _best_checkpoint(trainer: Trainer) -> str:

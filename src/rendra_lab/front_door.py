@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import os
 import re
@@ -21,6 +22,8 @@ from rendra_lab.sweep import conclude_sweep
 
 _EXIT_MISTAKE = 2  # the command or the configuration cannot be
 _EXIT_FAILURE = 1  # the run failed
+_MISTAKES = (HydraException, OmegaConfBaseException, UserError)
+_WORDED = (*_MISTAKES, ValueError, OSError)  # exceptions that say what is wrong to someone without the source
 
 
 def guarded(main: Callable[[], Any], script: str, config_path: str, config_name: str) -> None:
@@ -43,17 +46,19 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         main()
         if FailureKeeper.failure is not None:
             raise FailureKeeper.failure
-    except (HydraException, OmegaConfBaseException, ValueError, OSError) as error:
-        conclude_sweep()
-        if verbose:
+    except Exception as error:
+        if conclude_sweep() is not None and not verbose:
+            sys.exit(_EXIT_FAILURE)  # the table has said it
+        if verbose or not isinstance(error, _WORDED):
             raise
         message = explain(error, Path(script).resolve().parent / config_path, config_name)
         sys.stderr.write(f"{Path(script).name}: {message}\n")
-        sys.exit(_EXIT_MISTAKE if _is_mistake(error) else _EXIT_FAILURE)
-    except BaseException:
+        before_the_run = FailureKeeper.failure is None
+        sys.exit(_EXIT_MISTAKE if before_the_run or isinstance(error, _MISTAKES) else _EXIT_FAILURE)
+    except BaseException:  # an interrupted sweep has its table too
         conclude_sweep()
         raise
-    if not conclude_sweep():
+    if conclude_sweep() is False:
         sys.exit(_EXIT_FAILURE)
 
 
@@ -74,9 +79,9 @@ class FailureKeeper(Callback):
 
 def explain(error: Exception, config_dir: Path, config_name: str) -> str:
     """One line about what went wrong, with the nearest thing that exists."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
-        group, _, name = error.missing_cfg_file.rpartition("/")
-        return f"there is no {group} {name!r}; {_nearest(name, list(error.options))}"
+    absent = re.search(r"Could not (?:find|load) '([^']+)/([^'/]+)'", str(error))
+    if isinstance(error, MissingConfigException) and absent:
+        return f"there is no {absent[1]} {absent[2]!r}; {_nearest(absent[2], known_options(absent[1], config_dir, config_name))}"
     unknown = re.search(r"Could not override '([^'@]+)(?:@[^']*)?'", str(error))
     if unknown:
         return _explain_key(unknown[1], config_dir, config_name)
@@ -87,19 +92,38 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
 
 
 def known_keys(config_dir: Path, config_name: str) -> list[str]:
-    """Every dotted key of the default configuration and every group."""
-    from hydra import compose, initialize_config_dir
+    """Every dotted key of the configuration that the command line chooses groups for, and every group."""
+    from hydra import compose
+
+    chosen = [item for item in sys.argv[1:] if _chooses_group(item, config_dir)]
+    groups = [str(path.relative_to(config_dir)) for path in config_dir.rglob("*") if path.is_dir()]
+    with _hydra(config_dir):
+        for overrides in ([*_search_path(), *chosen], _search_path()):
+            with contextlib.suppress(HydraException):
+                return list(dict.fromkeys([*_dotted(compose(config_name, overrides=overrides)), *groups]))
+    return groups
+
+
+def known_options(group: str, config_dir: Path, config_name: str) -> list[str]:
+    """The choices of a group, wherever Hydra looks for them."""
+    with _hydra(config_dir) as loader, contextlib.suppress(HydraException):
+        options = loader.get_group_options(group, config_name=config_name, overrides=_search_path())
+        return [str(option) for option in options]
+    return []
+
+
+@contextlib.contextmanager
+def _hydra(config_dir: Path) -> Iterator[Any]:
+    from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
 
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(config_dir), version_base="1.3"):
-        overrides = [item for item in sys.argv[1:] if _chooses_group(item, config_dir)]
-        try:
-            cfg = compose(config_name, overrides=overrides)
-        except HydraException:
-            cfg = compose(config_name)
-    groups = [str(path.relative_to(config_dir)) for path in config_dir.rglob("*") if path.is_dir()]
-    return list(dict.fromkeys([*_dotted(cfg), *groups]))
+        yield GlobalHydra.instance().config_loader()
+
+
+def _search_path() -> list[str]:
+    return [item for item in sys.argv[1:] if item.startswith("hydra.searchpath=")]
 
 
 def _explain_key(key: str, config_dir: Path, config_name: str) -> str:
@@ -109,9 +133,10 @@ def _explain_key(key: str, config_dir: Path, config_name: str) -> str:
 
 
 def _nearest(word: str, known: list[str], preferred: list[str] | None = None) -> str:
-    near = (preferred or [])[:3] or difflib.get_close_matches(word, known, 3, cutoff=0.6)
+    near = preferred or difflib.get_close_matches(word, known, 3, cutoff=0.6)
     if near:
-        return f"did you mean {' or '.join(near)}?"
+        clear = difflib.SequenceMatcher(None, word, near[0]).ratio() > 0.85
+        return f"did you mean {' or '.join(near[: 1 if clear else 3])}?"
     if len(known) <= 30:
         return f"there are: {', '.join(sorted(known)) or 'none'}"
     return "see --help for what there is"
@@ -119,7 +144,8 @@ def _nearest(word: str, known: list[str], preferred: list[str] | None = None) ->
 
 def _chooses_group(override: str, config_dir: Path) -> bool:
     name, _, choice = override.partition("=")
-    return bool(choice) and "," not in choice and (config_dir / name).is_dir()
+    single = bool(choice) and ("," not in choice or choice.startswith("["))
+    return single and (config_dir / name).is_dir()
 
 
 def _dotted(cfg: DictConfig) -> Iterator[str]:
@@ -129,7 +155,8 @@ def _dotted(cfg: DictConfig) -> Iterator[str]:
         prefix, node = stack.pop()
         for name, value in node.items():
             key = f"{prefix}.{name}" if prefix else str(name)
-            yield key
+            if not key.endswith("_"):
+                yield key
             if isinstance(value, dict):
                 stack.append((key, value))
 
@@ -141,7 +168,3 @@ def _plain(error: Exception) -> str:
         return f"{place[1] if place else 'configuration'}: {' '.join(str(cause).split())}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if isinstance(error, HydraException) and lines else " ".join(lines) or type(error).__name__
-
-
-def _is_mistake(error: Exception) -> bool:
-    return isinstance(error, (HydraException, OmegaConfBaseException, UserError))

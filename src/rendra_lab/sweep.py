@@ -22,7 +22,7 @@ Row = dict[str, Any]
 
 def job_folder(number: Any, overrides: str) -> str:
     """The folder of one job: its number and what was set, safe and short enough for a file name."""
-    words = re.sub(r"[^A-Za-z0-9._=+-]+", "-", overrides or "").strip("-.")[:80].rstrip("-.=")
+    words = re.sub(r"[^A-Za-z0-9._=+-]+", "-", overrides or "").replace("+", "").strip("-.")[:80].rstrip("-.=")
     return f"{number}_{words}" if words else str(number)
 
 
@@ -44,13 +44,12 @@ class SweepTable(Callback):
             write_summary(Path(config.hydra.sweep.dir))
 
 
-def conclude_sweep() -> bool:
-    """Prints the table of the sweep of this process. True if there was none, or all its runs succeeded."""
-    if not _running or not _running[0].is_dir():
-        return True
-    folder = _running.pop()
-    rows = write_summary(folder)
-    _print_table(folder, rows)
+def conclude_sweep() -> bool | None:
+    """Prints the table of the sweep that this process ran; whether all its runs succeeded, None without one."""
+    rows = write_summary(_running[0]) if _running and _running[0].is_dir() else []
+    if not rows:
+        return None
+    _print_table(_running.pop(), rows)
     return all(row["status"] == "ok" for row in rows)
 
 
@@ -113,8 +112,8 @@ def _cells(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
             str(row["job"]),
             *(row["settings"].get(key, "-") for key in varied),
             *(format_number(row["metrics"].get(name)) for name in names),
-            format_number(row["seconds"]),
-            row["status"] if row["error"] is None else f"{row['status']}: {_one_line(row['error'])}",
+            "-" if row["seconds"] is None else f"{row['seconds']:.1f}",
+            row["status"],
         ]
         for row in rows
     ]
@@ -140,5 +139,10 @@ def _print_table(folder: Path, rows: list[Row]) -> None:
         table.add_row(*line, style="red" if row["status"] != "ok" else None)
     place = short_path(folder)
     console.print(table)
+    for row in rows:
+        if row["status"] != "ok":
+            reason = _one_line(row["error"] or "it ended without a word")
+            console.print(f"job {row['job']} {row['status']}: {reason}", highlight=False, markup=False)
+            console.print(f"          more in {place}/{row['folder']}/train.log", highlight=False, soft_wrap=True)
     console.print(f"results   {place} (summary.md, .csv, .json)", highlight=False, soft_wrap=True)
     console.print(f"look      tensorboard --logdir {place}", highlight=False, soft_wrap=True)

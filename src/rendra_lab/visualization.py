@@ -121,6 +121,13 @@ def resize(picture: Picture, height_px: int) -> Picture:
     return np.asarray(Image.fromarray(picture).resize(size, method))
 
 
+def silhouette_overlay(fit: Tensor, target: Tensor) -> Tensor:
+    """Two silhouettes (H, W) in one image (H, W, 3): grey where both are, blue the fit alone, orange the target."""
+    fit, target = fit[..., None], target[..., None]
+    blue, orange = fit.new_tensor([0.15, 0.45, 0.9]), fit.new_tensor([0.95, 0.55, 0.1])
+    return 1 - fit * target * 0.35 - fit * (1 - target) * (1 - blue) - (1 - fit) * target * (1 - orange)
+
+
 def save_picture(path: str | Path, picture: Picture) -> Path:
     """Writes a PNG or JPEG, by the ending of the path; makes the folder."""
     path = Path(path)

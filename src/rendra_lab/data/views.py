@@ -1,0 +1,176 @@
+"""One view of a known mesh: rendered from a camera that we know, or a user's photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from lightning.pytorch import LightningDataModule
+from PIL import Image, ImageOps, UnidentifiedImageError
+from torch import Tensor
+from torch.nn import functional as F
+
+from rendra.renderer.cameras import look_at_view_transform
+from rendra_lab.data.repeated import Repeated
+from rendra_lab.errors import UserError
+from rendra_lab.networks.mesh_view import MeshView
+from rendra_lab.records import TensorRecord
+
+_HARD_EDGE = 1e-9  # squared NDC: a small fraction of a pixel
+
+
+@dataclass(frozen=True)
+class ViewBatch(TensorRecord):
+    """What cameras saw, and where they stood if that is known (x_view = x_world @ R + T)."""
+
+    rgb: Float[Tensor, "B H W 3"]  # sRGB in [0, 1], the scene's background where nothing is
+    silhouette: Float[Tensor, "B H W"]  # coverage by the mesh, in [0, 1]
+    R: Float[Tensor, "B 3 3"]
+    T: Float[Tensor, "B 3"]
+    is_known: Bool[Tensor, " B"]  # whether R and T are the truth, or unknown and an identity
+    frame: Float[Tensor, " B"]  # number in its sequence
+
+    def resized(self, size: tuple[int, int]) -> ViewBatch:
+        """The same views at (H, W) pixels, each the mean of what it covers."""
+        images = torch.cat([self.rgb, self.silhouette[..., None]], dim=-1).movedim(-1, 1)
+        images = F.interpolate(images, size, mode="area").movedim(1, -1)
+        return ViewBatch(images[..., :3], images[..., 3], self.R, self.T, self.is_known, self.frame)
+
+
+@torch.no_grad()
+def render_views(scene: MeshView, R: Tensor, T: Tensor) -> ViewBatch:
+    """What the scene shows to cameras R (B, 3, 3), T (B, 3); the silhouette is the exact coverage of pixel centres."""
+    # a soft edge is fatter than the mesh, since every face near it adds its own: here the edge is hard
+    views = [scene(R[i : i + 1], T[i : i + 1], sigma=_HARD_EDGE) for i in range(len(R))]
+    silhouettes = torch.cat([(silhouette > 0.5).float() for silhouette, _ in views])
+    known = torch.ones(len(R), dtype=torch.bool)
+    return ViewBatch(torch.cat([rgb for _, rgb in views]), silhouettes, R, T, known, torch.arange(len(R)).float())
+
+
+class SingleView(LightningDataModule):
+    """One view, again and again; subclasses say where it comes from.
+
+    Args:
+        scene: the known mesh, its intrinsics and lights.
+        steps: optimisation steps an epoch.
+    """
+
+    target: ViewBatch
+
+    def __init__(self, scene: MeshView, steps: int = 10_000) -> None:
+        super().__init__()
+        self.scene = scene
+        self.steps = steps
+
+    def train_dataloader(self) -> Repeated[ViewBatch]:
+        """The view, `steps` times."""
+        return Repeated(self.target, self.steps)
+
+    def test_dataloader(self) -> Repeated[ViewBatch]:
+        """The view, once."""
+        return Repeated(self.target)
+
+
+class RenderedView(SingleView):
+    """A view from a known camera that looks at the origin.
+
+    Args:
+        scene: the mesh to render.
+        distance: of the camera from the origin, in world units.
+        elevation_deg: angle above the horizontal plane.
+        azimuth_deg: angle around +Y, from +Z.
+        steps: optimisation steps an epoch.
+    """
+
+    def __init__(
+        self,
+        scene: MeshView,
+        distance: float = 3.0,
+        elevation_deg: float = 50.0,
+        azimuth_deg: float = 0.0,
+        steps: int = 10_000,
+    ) -> None:
+        super().__init__(scene, steps)
+        self.R, self.T = look_at_view_transform(distance, elevation_deg, azimuth_deg)
+
+    def setup(self, stage: str) -> None:
+        """Lightning's hook: renders the view."""
+        self.target = render_views(self.scene, self.R, self.T)
+
+
+class PhotoView(SingleView):
+    """A photograph of the mesh: RGBA, or with a mask beside it.
+
+    The photograph is fitted into the scene's image size, centred, with the scene's background around it; its
+    principal point is taken to be its middle, and its field of view the scene's.
+
+    Args:
+        scene: the mesh that the photograph shows.
+        image: the photograph, any format that Pillow reads; EXIF orientation is followed.
+        mask: an image of the same size, bright where the mesh is; None takes the photograph's alpha.
+        steps: optimisation steps an epoch.
+
+    Raises:
+        UserError: a file that is missing, broken or does not fit.
+    """
+
+    def __init__(
+        self, scene: MeshView, image: str | Path, mask: str | Path | None = None, steps: int = 10_000
+    ) -> None:
+        super().__init__(scene, steps)
+        self.photo, self.mask = read_photo(image, mask)
+
+    def setup(self, stage: str) -> None:
+        """Lightning's hook: fits the photograph into the scene's image size."""
+        background = torch.tensor(self.scene.background)
+        rgb = self.photo * self.mask[..., None] + background * (1 - self.mask[..., None])
+        rgba = _fit_into(torch.cat([rgb, self.mask[..., None]], dim=-1), self.scene.image_size)
+        rgb = rgba[..., :3] + background * (1 - rgba[..., 4:])  # outside the photograph
+        self.target = ViewBatch(
+            rgb[None], rgba[None, ..., 3], torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool),
+            torch.zeros(1),
+        )  # fmt: skip
+
+
+def read_photo(image: str | Path, mask: str | Path | None = None) -> tuple[Tensor, Tensor]:
+    """Colours (H, W, 3) and mask (H, W) of a photograph, in [0, 1]; UserError says what is wrong with a file."""
+    picture = _open(image)
+    if mask is None:
+        if "A" not in picture.getbands() and "transparency" not in picture.info:
+            raise UserError(f"{image} has no alpha channel: give a mask beside it with data.mask=FILE")
+        coverage = picture.convert("RGBA").getchannel("A")
+    else:
+        coverage = _open(mask).convert("L")
+        if coverage.size != picture.size:
+            raise UserError(f"the mask {mask} is {coverage.size} pixels large, its image {image} {picture.size}")
+    colours = np.asarray(picture.convert("RGBA").convert("RGB"), np.float32) / 255
+    covered = np.asarray(coverage, np.float32) / 255
+    if not covered.max() > 0.5:
+        raise UserError(f"the mask of {image} is empty: there is nothing to fit")
+    return torch.from_numpy(colours), torch.from_numpy(covered)
+
+
+def _open(path: str | Path) -> Image.Image:
+    if not Path(path).is_file():
+        raise UserError(f"there is no image {path}")
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+            return ImageOps.exif_transpose(picture)
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError, SyntaxError) as error:
+        raise UserError(f"{path} is not an image that can be read: {error}") from error
+
+
+def _fit_into(rgba: Tensor, size: tuple[int, int]) -> Tensor:
+    """The image (h, w, 4) scaled into (H, W), centred, with a fifth channel that is one where it lies."""
+    height, width = size
+    scale = min(height / rgba.shape[0], width / rgba.shape[1])
+    inner = (max(1, round(rgba.shape[0] * scale)), max(1, round(rgba.shape[1] * scale)))
+    layers = torch.cat([rgba, torch.ones_like(rgba[..., :1])], dim=-1).movedim(-1, 0)[None]
+    layers = F.interpolate(layers, inner, mode="bilinear", antialias=True, align_corners=False)
+    top, left = (height - inner[0]) // 2, (width - inner[1]) // 2
+    padding = (left, width - inner[1] - left, top, height - inner[0] - top)
+    return F.pad(layers, padding)[0].movedim(0, -1).clamp(0, 1)

@@ -1,0 +1,88 @@
+"""A textured mesh as a camera sees it: its soft silhouette and its colours, differentiable in the pose."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rendra.renderer import (
+    BlendParams,
+    FoVPerspectiveCameras,
+    HardPhongShader,
+    MeshRasterizer,
+    MeshRenderer,
+    PointLights,
+    RasterizationSettings,
+    SoftPhongShader,
+    SoftSilhouetteShader,
+)
+from rendra.structures import Meshes
+
+_NEGLIGIBLE = 1e-4  # coverage at which a face stops reaching outwards
+
+
+class MeshView(nn.Module):
+    """Renders one mesh from any number of poses.
+
+    Args:
+        mesh: a batch of one, with a texture.
+        image_size: height and width, or the side of a square, in pixels.
+        fov_deg: field of view of the short side.
+        sigma: width of the silhouette's edge, squared NDC (the book: 1e-4).
+        layers: faces blended in a pixel's colour. 1 takes the nearest face, hard-edged: colours then move the
+            pose through the texture alone, and the silhouette moves the outline. More blend softly, as the book.
+        lights: of rendra.renderer; None is one point light at (2, 2, -2).
+        background: colour behind the mesh, sRGB in [0, 1].
+    """
+
+    def __init__(
+        self,
+        mesh: Meshes,
+        image_size: int | tuple[int, int] = 256,
+        fov_deg: float = 60.0,
+        sigma: float = 1e-4,
+        layers: int = 1,
+        lights: Any = None,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> None:
+        super().__init__()
+        if len(mesh) != 1:
+            raise ValueError(f"a MeshView shows one mesh, got a batch of {len(mesh)}")
+        self.mesh = mesh
+        self.image_size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        self.fov_deg = fov_deg
+        self.sigma = sigma
+        self.layers = layers
+        self.lights = PointLights(location=((2.0, 2.0, -2.0),)) if lights is None else lights
+        self.background = tuple(background)
+
+    def forward(
+        self, R: Tensor, T: Tensor, image_size: tuple[int, int] | None = None, sigma: float | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Silhouettes (B, H, W) and colours (B, H, W, 3), both in [0, 1], from the poses R (B, 3, 3), T (B, 3).
+
+        `image_size` and `sigma` replace the view's own, for coarse-to-fine fits.
+        """
+        self._follow(R.device)
+        size, sigma = image_size or self.image_size, sigma or self.sigma
+        cameras = FoVPerspectiveCameras(R=R, T=T, fov=self.fov_deg, aspect_ratio=1.0, device=R.device)
+        meshes = self.mesh.extend(len(R)) if len(R) > 1 else self.mesh
+        blend = BlendParams(sigma=sigma, gamma=1e-4, background_color=self.background)
+        reach = math.log(1 / _NEGLIGIBLE - 1) * sigma
+        outline = MeshRenderer(
+            MeshRasterizer(cameras, RasterizationSettings(size, blur_radius=reach)), SoftSilhouetteShader(blend)
+        )
+        soft = self.layers > 1
+        settings = RasterizationSettings(size, reach if soft else 0.0, faces_per_pixel=self.layers)
+        shader = (SoftPhongShader if soft else HardPhongShader)(
+            device=R.device, cameras=cameras, lights=self.lights, blend_params=blend
+        )
+        colours = MeshRenderer(MeshRasterizer(cameras, settings), shader)
+        return outline(meshes)[..., 3], colours(meshes)[..., :3]
+
+    def _follow(self, device: torch.device) -> None:
+        if self.mesh.device != device:
+            self.mesh, self.lights = self.mesh.to(device), self.lights.to(device)
