@@ -35,9 +35,15 @@ class ViewBatch(TensorRecord):
 
     def resized(self, size: tuple[int, int]) -> ViewBatch:
         """The same views at (H, W) pixels, each the mean of what it covers."""
-        images = torch.cat([self.rgb, self.silhouette[..., None]], dim=-1).movedim(-1, 1)
-        images = F.interpolate(images, size, mode="area").movedim(1, -1)
-        return ViewBatch(images[..., :3], images[..., 3], self.R, self.T, self.is_known, self.frame)
+        rgb, silhouette = shrink(self.rgb, self.silhouette, size)
+        return ViewBatch(rgb, silhouette, self.R, self.T, self.is_known, self.frame)
+
+
+def shrink(rgb: Tensor, silhouette: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Colours (B, H, W, 3) and silhouettes (B, H, W) at a smaller size, each pixel the mean of what it covers."""
+    images = torch.cat([rgb, silhouette[..., None]], dim=-1).movedim(-1, 1)
+    images = F.interpolate(images, size, mode="area").movedim(1, -1)
+    return images[..., :3], images[..., 3]
 
 
 @torch.no_grad()

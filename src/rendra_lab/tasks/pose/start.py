@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,8 +15,17 @@ from rendra_lab.networks.camera_pose import CameraPose, SixDofPose, look_at_orig
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.optimizers import levenberg_marquardt_step
 
-Compare = Callable[[Tensor, Tensor, ViewBatch, float], Tensor]
-"""Poses R (M, 3, 3), T (M, 3), one target and a sigma -> residual vectors (M, D)."""
+Compare = Callable[[Tensor, Tensor, ViewBatch, tuple[int, int], float], Tensor]
+"""Poses R (M, 3, 3), T (M, 3), one target, a size to render at and an edge sigma -> residual vectors (M, D)."""
+
+
+class Level(NamedTuple):
+    """One stage of a search."""
+
+    side_px: int  # short side of the rendered images
+    shrunk_px: int  # short side of the images that are compared: smooth enough for Gauss-Newton
+    kept: int  # poses that go on
+    steps: int  # Gauss-Newton steps of each
 
 
 class GivenStart:
@@ -45,7 +55,7 @@ class MultiStart:
     Args:
         directions: number of directions; neighbours are about 200 / sqrt(directions) degrees apart.
         rolls: turns about the optical axis, tried by a free camera alone.
-        levels: (side in pixels, poses kept, steps) from coarse to fine.
+        levels: the stages from coarse to fine (`Level`: side_px, shrunk_px, kept, steps).
         difference: step of the numerical derivatives, world units or rad.
         at_once: poses rendered together.
     """
@@ -54,15 +64,15 @@ class MultiStart:
         self,
         directions: int = 256,
         rolls: int = 12,
-        levels: Sequence[Sequence[int]] = ((64, 12, 8), (128, 3, 6)),
-        difference: float = 0.02,
+        levels: Sequence[Sequence[int]] = ((64, 16, 12, 6), (128, 32, 4, 6), (256, 64, 2, 5)),
+        difference: float = 0.03,
         at_once: int = 32,
     ) -> None:
         if directions < 1 or rolls < 1 or not levels:
             raise ValueError("a search needs at least one direction, one roll and one level")
         self.directions = directions
         self.rolls = rolls
-        self.levels = [(int(side), int(kept), int(steps)) for side, kept, steps in levels]
+        self.levels = [Level(*level) for level in levels]
         self.difference = difference
         self.at_once = at_once
 
@@ -75,22 +85,21 @@ class MultiStart:
         """
         if not target.silhouette.amax() > 0.5:
             raise ValueError("the target's silhouette is empty: there is no pose to find")
-        small, _ = self._level(scene, target, self.levels[0][0])
-        R, T = self._hypotheses(scene, pose, small)
-        for side, kept, steps in self.levels:
-            small, sigma = self._level(scene, target, side)
-            cost = self._chunked(lambda R, T: compare(R, T, small, sigma).square().sum(-1)[:, None], R, T)[:, 0]
-            best = cost.argsort()[:kept]
-            R, T = self._refine(pose, R[best], T[best], small, sigma, steps, compare)
-        cost = compare(R, T, small, sigma).square().sum(-1)
-        return R[cost.argmin()][None], T[cost.argmin()][None]
+        R, T = self._hypotheses(scene, pose, target.resized(_scaled(scene, self.levels[0].side_px)))
+        for level in self.levels:
+            residuals = self._residuals(scene, target, level, compare)
+            best = residuals(R, T).square().sum(-1).argsort()[: level.kept]
+            R, T = self._refine(pose, R[best], T[best], residuals, level.steps)
+        best = residuals(R, T).square().sum(-1).argmin()
+        return R[best][None], T[best][None]
 
-    def _level(self, scene: MeshView, target: ViewBatch, side: int) -> tuple[ViewBatch, float]:
-        """The target with a short side of at most `side` pixels, and an edge as many pixels wide as at full size."""
-        height, width = scene.image_size
-        scale = min(1.0, side / min(height, width))
-        size = (max(1, round(height * scale)), max(1, round(width * scale)))
-        return target.resized(size), 3e-6 / scale**2
+    def _residuals(
+        self, scene: MeshView, target: ViewBatch, level: Level, compare: Compare
+    ) -> Callable[[Tensor, Tensor], Tensor]:
+        """The comparison of any number of poses at one level; its edge is as many pixels wide as at full size."""
+        size, shrunk = _scaled(scene, level.side_px), target.resized(_scaled(scene, level.shrunk_px))
+        sigma = scene.sigma * (min(scene.image_size) / min(size)) ** 2
+        return lambda R, T: self._chunked(lambda R, T: compare(R, T, shrunk, size, sigma), R, T)
 
     def _hypotheses(self, scene: MeshView, pose: CameraPose, target: ViewBatch) -> tuple[Tensor, Tensor]:
         """Poses all around the mesh, as far and as shifted as their silhouettes say."""
@@ -113,24 +122,20 @@ class MultiStart:
         return R, T
 
     def _refine(
-        self, pose: CameraPose, R: Tensor, T: Tensor, target: ViewBatch, sigma: float, steps: int, compare: Compare
+        self, pose: CameraPose, R: Tensor, T: Tensor, residuals: Callable[[Tensor, Tensor], Tensor], steps: int
     ) -> tuple[Tensor, Tensor]:
         """Levenberg-Marquardt on all poses side by side."""
-        base_R, base_T = R, T
         delta, damping = R.new_zeros(len(R), pose.degrees_of_freedom), R.new_full((len(R),), 1e-2)
 
-        def residuals(delta: Tensor) -> Tensor:
+        def moved(delta: Tensor) -> Tensor:
             tried = delta.shape[1]
-            poses = pose.retract(
-                base_R.repeat_interleave(tried, 0), base_T.repeat_interleave(tried, 0), delta.flatten(0, 1)
-            )
-            rows = self._chunked(lambda R, T: compare(R, T, target, sigma), *poses)
-            return rows.view(len(base_R), tried, -1)
+            bases = R.repeat_interleave(tried, 0), T.repeat_interleave(tried, 0)
+            return residuals(*pose.retract(*bases, delta.flatten(0, 1))).unflatten(0, (len(R), tried))
 
-        longest = 0.15 * float(base_T.norm(dim=1).mean())
+        longest = 0.2 * float(T.norm(dim=1).mean())
         for _ in range(steps):
-            delta, damping, _ = levenberg_marquardt_step(residuals, delta, damping, self.difference, longest)
-        return pose.retract(base_R, base_T, delta)
+            delta, damping, _ = levenberg_marquardt_step(moved, delta, damping, self.difference, longest)
+        return pose.retract(R, T, delta)
 
     def _chunked(self, function: Callable[[Tensor, Tensor], Tensor], R: Tensor, T: Tensor) -> Tensor:
         """The function of a few poses at a time."""
@@ -143,6 +148,13 @@ def sphere_directions(count: int) -> Tensor:
     angle = torch.arange(count) * (math.pi * (3 - math.sqrt(5)))
     ring = (1 - height.square()).sqrt()
     return torch.stack([ring * angle.cos(), height, ring * angle.sin()], dim=-1)
+
+
+def _scaled(scene: MeshView, side_px: int) -> tuple[int, int]:
+    """The scene's (H, W) with a short side of `side_px` pixels, or as it is if that is smaller."""
+    height, width = scene.image_size
+    scale = min(1.0, side_px / min(height, width))
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def _viewing_distance(scene: MeshView) -> float:

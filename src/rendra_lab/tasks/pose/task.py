@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rendra_lab.base_task import Task
-from rendra_lab.data.views import ViewBatch
+from rendra_lab.data.views import ViewBatch, shrink
 from rendra_lab.networks.camera_pose import CameraPose, PosePrediction
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.tasks.pose.start import GivenStart, MultiStart
@@ -57,14 +57,14 @@ class Pose(Task[ViewBatch, PosePrediction]):
         self.start_R.copy_(R)
         self.start_T.copy_(T)
 
-    def compare(self, R: Tensor, T: Tensor, target: ViewBatch, sigma: float) -> Tensor:
-        """Residual vectors (M, D) of the poses R (M, 3, 3), T (M, 3) against one target, at the target's size."""
-        size = (target.silhouette.shape[1], target.silhouette.shape[2])
+    def compare(self, R: Tensor, T: Tensor, target: ViewBatch, size: tuple[int, int], sigma: float) -> Tensor:
+        """Residual vectors (M, D) of the poses R (M, 3, 3), T (M, 3) against one target.
+
+        The mesh is rendered at `size` with the edge `sigma`, then shrunk to the target's size: a smooth function.
+        """
         silhouettes, colours = self.scene(R, T, size, sigma)
-        seen = [
-            PosePrediction(colours[i : i + 1], silhouettes[i : i + 1], R[i : i + 1], T[i : i + 1])
-            for i in range(len(R))
-        ]
+        colours, silhouettes = shrink(colours, silhouettes, (target.rgb.shape[1], target.rgb.shape[2]))
+        seen = [PosePrediction(*(x[i : i + 1] for x in (colours, silhouettes, R, T))) for i in range(len(R))]
         return torch.stack([self.residuals_of(one, target) for one in seen])
 
     def panels(self, prediction: PosePrediction, batch: ViewBatch) -> dict[str, Tensor]:
