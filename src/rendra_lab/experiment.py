@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import inspect
 import logging
 import os
+import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,9 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     if cfg.threads is not None:
         torch.set_num_threads(int(cfg.threads))
     seed_everything(_seed(cfg), workers=True, verbose=False)
-    data = instantiate(cfg.data, _convert_="all")
-    task = instantiate(cfg.module, _convert_="all")
+    shared = {} if cfg.scene is None else {"scene": instantiate(cfg.scene, _convert_="all")}
+    data = instantiate(cfg.data, _convert_="all", **shared)
+    task = instantiate(cfg.module, _convert_="all", **shared)
     settings: dict[str, Any] = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     if observers:
         callbacks = _parts(cfg.callbacks)
@@ -285,7 +287,7 @@ def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock
     return metrics
 
 
-@contextmanager
+@contextlib.contextmanager
 def _own_processes(experiment: Experiment) -> Iterator[None]:
     """Distributed processes of one run begin and end with it.
 
@@ -306,11 +308,25 @@ def _own_processes(experiment: Experiment) -> Iterator[None]:
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
         for process in getattr(experiment.trainer.strategy.launcher, "procs", []):
-            process.wait(timeout=120)
+            _end_process(process)
         for name in ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE"):
             os.environ.pop(name, None)
             if name in environment:
                 os.environ[name] = environment[name]
+
+
+def _end_process(process: subprocess.Popen) -> None:
+    """Waits for a process of a run that is over; then nobody may judge it by its exit code any more.
+
+    Lightning watches that code every five seconds and kills this process too when it is not 0, in the middle of
+    the next job of a sweep.
+    """
+    for end in (lambda: None, process.terminate, process.kill):
+        end()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=10)
+            break
+    process.returncode = 0
 
 
 def _best_checkpoint(trainer: Trainer) -> str:
