@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# Tests run side by side: threads that wait must sleep, or they take the cores from those that work.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import pytest
 import torch
 

@@ -52,6 +52,10 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         """Meshes worth looking at, by name: each a `rendra.structures.Meshes`."""
         return {}
 
+    def facts(self, prediction: PredictionT, batch: BatchT) -> dict[str, Any]:
+        """Results for other programs, by file name: numbers, strings and lists of them."""
+        return {}
+
     def score(self, prediction: PredictionT, batch: BatchT) -> dict[str, Tensor | Metric]:
         """Every metric on this batch, by name."""
         return {name: _named(name, term, prediction, batch) for name, term in self.metrics.items()}
@@ -65,6 +69,11 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         """The meshes of a batch, as evaluation sees it; modes, gradients and random state stay untouched."""
         with self._observed():
             return self.meshes(self.predict(batch), batch)
+
+    def show_facts(self, batch: BatchT) -> dict[str, Any]:
+        """The facts of a batch, as evaluation sees it; modes, gradients and random state stay untouched."""
+        with self._observed():
+            return self.facts(self.predict(batch), batch)
 
     def validation_step(self, batch: BatchT, batch_idx: int) -> None:
         """Lightning's hook: scores one validation batch under `val/`."""

@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 
-from rendra_lab import visualization
+from rendra_lab import report, visualization
 from rendra_lab.base_task import BaseTask
 from rendra_lab.loggers import TensorBoard
 
@@ -310,6 +310,109 @@ class MeshLogger(Callback):
             for name, meshes in shown.items():
                 _add_mesh(writer, name, meshes, trainer.global_step)
         return shown
+
+
+class FactWriter(Callback):
+    """Leaves the facts of a task as JSON files when the fit ends.
+
+    Args:
+        folder: of the files.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self._batch: Any = None
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Remembers what the fit sees."""
+        self._batch = batch
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the files."""
+        if self._batch is not None and _shows(trainer, pl_module, "facts"):
+            assert isinstance(pl_module, BaseTask)
+            for name, fact in pl_module.show_facts(self._batch).items():
+                report.write_json(self.folder / f"{name}.json", fact)
+        self._batch = None
+
+
+class SequenceReport(Callback):
+    """Shows a fitted sequence in the test: `sequence.gif` of every batch's panels, `frames.csv` of its metrics.
+
+    Args:
+        folder: of the files.
+        fps: frames a second.
+        height_px: of the panels in a frame.
+    """
+
+    def __init__(self, folder: str, fps: float = 8.0, height_px: int = 192) -> None:
+        self.folder = Path(folder)
+        self.fps = fps
+        self.height_px = height_px
+        self._frames: list[np.ndarray] = []
+        self._rows: list[dict[str, float]] = []
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        """Keeps one frame and its numbers."""
+        if trainer.is_global_zero and isinstance(pl_module, BaseTask):
+            scores = pl_module.score(pl_module.predict(batch), batch)
+            numbers = {name: float(value) for name, value in scores.items() if isinstance(value, torch.Tensor)}
+            self._rows.append({"frame": batch_idx, **numbers})
+            self._frames.append(visualization.captioned_row(_pictures(pl_module, batch), self.height_px))
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the files."""
+        if self._frames:
+            visualization.save_animation(self.folder / "sequence.gif", self._frames, self.fps)
+            report.write_csv(self.folder / "frames.csv", self._rows)
+        self._frames, self._rows = [], []
+
+
+class StopWhenSettled(Callback):
+    """Ends a fit whose loss is low enough, or has not improved for a while.
+
+    Args:
+        monitor: what Lightning logs, such as `train/loss`.
+        below: the fit ends as soon as the value is smaller; None waits for nothing.
+        patience: steps without a new best by the share `improvement`; None waits for ever.
+        improvement: smallest gain that counts, as a share of the best value.
+    """
+
+    def __init__(
+        self,
+        monitor: str = "train/loss",
+        below: float | None = None,
+        patience: int | None = None,
+        improvement: float = 1e-3,
+    ) -> None:
+        self.monitor = monitor
+        self.below = below
+        self.patience = patience
+        self.improvement = improvement
+        self._best = float("inf")
+        self._waited = 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Looks at the newest value."""
+        value = float(trainer.callback_metrics[self.monitor])
+        improved = value < self._best * (1 - self.improvement)
+        self._waited = 0 if improved else self._waited + 1
+        self._best = min(self._best, value)
+        low = self.below is not None and value < self.below
+        if low or (self.patience is not None and self._waited >= self.patience):
+            trainer.should_stop = True
+
+    def state_dict(self) -> dict[str, Any]:
+        """For the checkpoint."""
+        return {"best": self._best, "waited": self._waited}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self._best, self._waited = state_dict["best"], state_dict["waited"]
 
 
 def _add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:

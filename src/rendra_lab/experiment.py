@@ -58,6 +58,7 @@ _IDLE_WARNINGS = (
     r".*Checkpoint directory.*",
     r".*IterableDataset.*has `__len__` defined.*",
     r".*you defined a `validation_step` but have no `val_dataloader`.*",
+    r"The dirpath has changed from.*",
     r".*LeafSpec.*is deprecated.*",
 )
 
@@ -86,7 +87,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
 
     Raises UserError for a forbidden `_target_` or an argument that it does not take, naming the key.
     """
-    _quieten()
+    quieten()
     check_targets(OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True))
     if cfg.threads is not None:
         torch.set_num_threads(int(cfg.threads))
@@ -162,6 +163,14 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
     experiment.task.load_state_dict(state["state_dict"])
     experiment.task.eval()
     return experiment
+
+
+def evaluate(experiment: Experiment) -> dict[str, float]:
+    """The test metrics of built or loaded parts; UserError where the data has no test set."""
+    if not _has_test(experiment.data):
+        raise UserError(f"{type(experiment.data).__name__} has no test data")
+    experiment.trainer.test(experiment.task, datamodule=experiment.data, verbose=False)
+    return _numbers(experiment.trainer)
 
 
 def find_checkpoint(wanted: str | None, run_folder: Path, output_root: Path) -> Path | None:
@@ -275,16 +284,31 @@ class _Clock:
 
 def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock) -> dict[str, float]:
     trainer, task, data = experiment.trainer, experiment.task, experiment.data
-    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"  # a checkpoint is data, never code
-    trainer.fit(task, datamodule=data, ckpt_path=None if checkpoint is None else str(checkpoint))
+    with _checkpoints_are_data():
+        trainer.fit(task, datamodule=data, ckpt_path=None if checkpoint is None else str(checkpoint))
     clock.lap("fit")
     metrics = _numbers(trainer)
-    if experiment.cfg.test is not None and is_overridden("test_dataloader", data, LightningDataModule):
+    if experiment.cfg.test is not None and _has_test(data):
         best = _best_checkpoint(trainer) if experiment.cfg.test == "best" else None
-        trainer.test(task, datamodule=data, ckpt_path=best, verbose=False)
+        with _checkpoints_are_data():
+            trainer.test(task, datamodule=data, ckpt_path=best, verbose=False)
         metrics.update(_numbers(trainer))
         clock.lap("test")
     return metrics
+
+
+@contextlib.contextmanager
+def _checkpoints_are_data() -> Iterator[None]:
+    """Whatever is loaded meanwhile is read as tensors and plain values; a file cannot run code."""
+    name = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(name)
+        if before is not None:
+            os.environ[name] = before
 
 
 @contextlib.contextmanager
@@ -299,7 +323,7 @@ def _own_processes(experiment: Experiment) -> Iterator[None]:
     if known is not None and known.mode == RunMode.MULTIRUN:
         hydra_own = [item for item in known.overrides.hydra if not item.startswith("hydra.mode=")]
         sys.argv = [arguments[0], *known.overrides.task, *hydra_own]
-        with read_write(known):
+        with read_write(known):  # type: ignore[arg-type]
             known.run.dir = str(experiment.folder)
     try:
         yield
@@ -330,24 +354,17 @@ def _end_process(process: subprocess.Popen) -> None:
 
 
 def _best_checkpoint(trainer: Trainer) -> str:
-    keeper = trainer.checkpoint_callback
-    if not isinstance(keeper, ModelCheckpoint) or not keeper.best_model_path:
-        raise UserError(
-            "test=best needs callbacks.checkpoint.monitor, such as val/psnr, and a validation before the end"
-        )
-    return keeper.best_model_path
+    for keeper in trainer.checkpoint_callbacks:
+        if isinstance(keeper, ModelCheckpoint) and keeper.monitor and keeper.best_model_path:
+            return keeper.best_model_path
+    raise UserError("test=best needs callbacks=[default,best], callbacks.best.monitor=val/..., and a validation")
 
 
 def _named_checkpoint(folder: Path, weights: str) -> Path:
-    if weights != "best":
-        path = Path(weights)
-        if not path.is_file():
-            raise UserError(f"there is no checkpoint at {weights}; say last, best or a file")
-        return path
-    kept = [path for path in folder.glob("checkpoints/*.ckpt") if path.name != "last.ckpt"]
-    if not kept:
-        raise UserError(f"{folder} has no best checkpoint; say last")
-    return max(kept, key=lambda path: path.stat().st_mtime_ns)
+    path = folder / "checkpoints" / "best.ckpt" if weights == "best" else Path(weights)
+    if not path.is_file():
+        raise UserError(f"there is no checkpoint at {path}; say last, best or a file")
+    return path
 
 
 def _task_folder(run_folder: Path, output_root: Path) -> Path:
@@ -357,6 +374,10 @@ def _task_folder(run_folder: Path, output_root: Path) -> Path:
     except ValueError:
         return run_folder.parent
     return output_root / relative.parts[0] if len(relative.parts) > 1 else run_folder.parent
+
+
+def _has_test(data: LightningDataModule) -> bool:
+    return is_overridden("test_dataloader", data, LightningDataModule)
 
 
 def _numbers(trainer: Trainer) -> dict[str, float]:
@@ -457,7 +478,8 @@ def _seed(cfg: DictConfig) -> int:
     return cfg.seed
 
 
-def _quieten() -> None:
+def quieten() -> None:
+    """Silences what Lightning says that a user can do nothing about; everything else is still heard."""
     for pattern in _IDLE_WARNINGS:
         warnings.filterwarnings("ignore", message=pattern)
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):

@@ -81,7 +81,8 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
     """One line about what went wrong, with the nearest thing that exists."""
     absent = re.search(r"Could not (?:find|load) '([^']+)/([^'/]+)'", str(error))
     if isinstance(error, MissingConfigException) and absent:
-        return f"there is no {absent[1]} {absent[2]!r}; {_nearest(absent[2], known_options(absent[1], config_dir, config_name))}"
+        options = known_options(absent[1], config_dir, config_name)
+        return f"there is no {absent[1]} {absent[2]!r}; {_nearest(absent[2], options)}"
     unknown = re.search(r"Could not override '([^'@]+)(?:@[^']*)?'", str(error))
     if unknown:
         return _explain_key(unknown[1], config_dir, config_name)

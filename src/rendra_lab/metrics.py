@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rendra.transforms import so3_log_map
+
 _PSNR_CEILING_DB = 100.0  # of two equal images
 
 
@@ -57,6 +59,24 @@ def iou(prediction: Tensor, target: Tensor, threshold: float = 0.5) -> Tensor:
     both = (predicted & wanted).flatten(1).sum(1)
     either = (predicted | wanted).flatten(1).sum(1)
     return torch.where(either > 0, both / either.clamp_min(1), torch.ones_like(both, dtype=torch.float)).mean()
+
+
+def rotation_error_deg(R: Tensor, truth: Tensor) -> Tensor:
+    """The angle of R truth^T in degrees, the mean over matrices (B, 3, 3); accurate for small angles."""
+    return torch.rad2deg(so3_log_map(R.double() @ truth.double().transpose(1, 2)).norm(dim=1)).mean()
+
+
+def length_error_percent(vector: Tensor, truth: Tensor) -> Tensor:
+    """How much the length of vectors (B, 3) differs, in percent of the true length, the mean over the batch.
+
+    Of camera positions in a world whose origin is looked at: the error of the distance.
+    """
+    return (100 * (vector.norm(dim=1) / truth.norm(dim=1) - 1).abs()).mean()
+
+
+def position_error_percent(position: Tensor, truth: Tensor) -> Tensor:
+    """How far positions (B, 3) are off, in percent of the true distance from the origin, the mean over the batch."""
+    return (100 * (position - truth).norm(dim=1) / truth.norm(dim=1)).mean()
 
 
 def _batched(prediction: Tensor, target: Tensor, dims: int = 4) -> tuple[Tensor, Tensor]:

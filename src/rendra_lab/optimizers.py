@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+_DOUBLINGS = 8  # of a step that pays: 256 times its length
 
 
 class LevenbergMarquardt(torch.optim.Optimizer):
@@ -21,8 +24,9 @@ class LevenbergMarquardt(torch.optim.Optimizer):
     Args:
         params: the parameters; one group.
         lr: largest change of a parameter in one step (trust region), in the parameter's unit.
-        difference: step of the numerical derivative, in the parameter's unit: about half a pixel's worth, so that
-            it averages over the image's own steps.
+        difference: steps of the numerical derivative, in the parameter's unit: the first one, wide enough to see
+            the large shape of the objective, is halved whenever no step helps, down to the second, about half a
+            pixel's worth: a finer one would differentiate the pixels' own steps.
         damping: first lambda.
         tries: steps tried before the state is left as it is.
     """
@@ -31,9 +35,18 @@ class LevenbergMarquardt(torch.optim.Optimizer):
     residuals: Callable[[], Tensor]
 
     def __init__(
-        self, params: Any, lr: float = 0.5, difference: float = 5e-3, damping: float = 1e-2, tries: int = 4
+        self,
+        params: Any,
+        lr: float = 0.5,
+        difference: Sequence[float] = (0.2, 5e-3),
+        damping: float = 1e-2,
+        tries: int = 4,
     ) -> None:
-        super().__init__(params, {"lr": lr, "difference": difference, "damping": damping, "tries": tries})
+        widest, finest = difference
+        if not widest >= finest > 0:
+            raise ValueError(f"difference goes from a wide to a fine positive step, got {list(difference)}")
+        defaults = {"lr": lr, "difference": float(widest), "finest": float(finest), "damping": damping, "tries": tries}
+        super().__init__(params, defaults)
         if len(self.param_groups) != 1:
             raise ValueError(f"LevenbergMarquardt takes one parameter group, got {len(self.param_groups)}")
 
@@ -45,12 +58,15 @@ class LevenbergMarquardt(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         group = self.param_groups[0]
-        x = torch.nn.utils.parameters_to_vector(group["params"])[None]
-        damping = x.new_full((1,), group["damping"])
+        start = torch.nn.utils.parameters_to_vector(group["params"])[None]
+        damping = start.new_full((1,), group["damping"])
         x, damping, _ = levenberg_marquardt_step(
-            self._residuals_at, x, damping, group["difference"], group["lr"], group["tries"]
+            self._residuals_at, start, damping, group["difference"], group["lr"], group["tries"], _DOUBLINGS
         )
         group["damping"] = float(damping)
+        if torch.equal(x, start):
+            group["difference"] = max(group["difference"] / 2, group["finest"])
+            group["damping"] = self.defaults["damping"]
         self._set(x[0])
         return loss
 
@@ -72,8 +88,12 @@ def levenberg_marquardt_step(
     difference: float,
     longest: float,
     tries: int = 1,
+    doublings: int = 0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One step of B independent problems side by side; each keeps its state unless its objective falls.
+
+    An image whose outline is off by many pixels is linear over one pixel only: the step points the right way but is
+    too short, and doubling it while that pays crosses the distance.
 
     Args:
         residuals: maps K states of every problem (B, K, P) to their residual vectors (B, K, R).
@@ -82,6 +102,7 @@ def levenberg_marquardt_step(
         difference: step of the forward difference.
         longest: bound on the length of a step.
         tries: steps tried, with growing damping, until all problems have moved.
+        doublings: how often a successful step is doubled as long as the objective falls.
 
     Returns:
         x (B, P), damping (B,) and the objectives (B,), sums of squares.
@@ -93,7 +114,7 @@ def levenberg_marquardt_step(
     jacobian = (values[:, 1:] - here[:, None]) / difference  # (B, P, R)
     normal = jacobian @ jacobian.transpose(1, 2)
     slope = (jacobian @ here[..., None])[..., 0]
-    cost, moved = here.square().sum(-1), torch.zeros_like(damping, dtype=torch.bool)
+    start, cost, moved = x, here.square().sum(-1), torch.zeros_like(damping, dtype=torch.bool)
     for _ in range(tries):
         step = _damped_step(normal, slope, damping, longest)
         rival = residuals((x + step)[:, None])[:, 0].square().sum(-1)
@@ -103,6 +124,14 @@ def levenberg_marquardt_step(
         moved |= better
         if bool(moved.all()):
             break
+    for _ in range(doublings):
+        further = x + (x - start)
+        moved = moved & ((further - start).norm(dim=1) <= longest)
+        if not bool(moved.any()):
+            break
+        rival = residuals(further[:, None])[:, 0].square().sum(-1)
+        moved = moved & (rival < cost)
+        x, cost = torch.where(moved[:, None], further, x), torch.where(moved, rival, cost)
     return x, damping, cost
 
 

@@ -167,7 +167,7 @@ def _save_mp4(path: Path, frames: Sequence[Picture], fps: float) -> None:
     try:
         import av  # noqa: F401
     except ImportError as error:
-        raise ImportError("MP4 needs a video encoder: pip install 'rendra[view]'; or choose .gif") from error
+        raise ImportError("MP4 needs a video encoder: pip install -e '.[view]'; or choose .gif") from error
     import imageio.v3 as imageio
 
     height, width = (size - size % 2 for size in frames[0].shape[:2])  # the codec halves the colour planes

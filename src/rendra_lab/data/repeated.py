@@ -21,10 +21,21 @@ class Repeated(Generic[BatchT]):
             raise ValueError(f"a batch is repeated at least once, got times={times}")
         self.batch = batch
         self.times = times
+        self._given = 0
+        self._resume_at = 0
 
     def __len__(self) -> int:
         return self.times
 
     def __iter__(self) -> Iterator[BatchT]:
-        for _ in range(self.times):
+        start, self._resume_at = self._resume_at, 0
+        for self._given in range(start + 1, self.times + 1):
             yield self.batch
+
+    def state_dict(self) -> dict[str, int]:
+        """How far the running epoch is; Lightning keeps it in checkpoints."""
+        return {"given": self._given}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Lets the next epoch be the rest of one that a checkpoint interrupted."""
+        self._resume_at = min(state["given"], self.times) % self.times

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from rendra.renderer.cameras import look_at_view_transform
 from rendra_lab.data.repeated import Repeated
 from rendra_lab.errors import UserError
+from rendra_lab.networks.camera_pose import camera_centre
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.records import TensorRecord
 
@@ -24,19 +25,27 @@ _HARD_EDGE = 1e-9  # squared NDC: a small fraction of a pixel
 
 @dataclass(frozen=True)
 class ViewBatch(TensorRecord):
-    """What cameras saw, and where they stood if that is known (x_view = x_world @ R + T)."""
+    """What cameras saw, and where they stood (x_view = x_world @ R + T); R and T are NaN where that is unknown."""
 
     rgb: Float[Tensor, "B H W 3"]  # sRGB in [0, 1], the scene's background where nothing is
     silhouette: Float[Tensor, "B H W"]  # coverage by the mesh, in [0, 1]
     R: Float[Tensor, "B 3 3"]
     T: Float[Tensor, "B 3"]
-    is_known: Bool[Tensor, " B"]  # whether R and T are the truth, or unknown and an identity
     frame: Float[Tensor, " B"]  # number in its sequence
+
+    @property
+    def position(self) -> Tensor:
+        """Where the cameras stood in the world: (B, 3)."""
+        return camera_centre(self.R, self.T)
+
+    def select(self, index: int) -> ViewBatch:
+        """One view, as a batch of one."""
+        return self._map(lambda value: value[index : index + 1], lambda value: isinstance(value, Tensor))
 
     def resized(self, size: tuple[int, int]) -> ViewBatch:
         """The same views at (H, W) pixels, each the mean of what it covers."""
         rgb, silhouette = shrink(self.rgb, self.silhouette, size)
-        return ViewBatch(rgb, silhouette, self.R, self.T, self.is_known, self.frame)
+        return ViewBatch(rgb, silhouette, self.R, self.T, self.frame)
 
 
 def shrink(rgb: Tensor, silhouette: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -52,8 +61,7 @@ def render_views(scene: MeshView, R: Tensor, T: Tensor) -> ViewBatch:
     # a soft edge is fatter than the mesh, since every face near it adds its own: here the edge is hard
     views = [scene(R[i : i + 1], T[i : i + 1], sigma=_HARD_EDGE) for i in range(len(R))]
     silhouettes = torch.cat([(silhouette > 0.5).float() for silhouette, _ in views])
-    known = torch.ones(len(R), dtype=torch.bool)
-    return ViewBatch(torch.cat([rgb for _, rgb in views]), silhouettes, R, T, known, torch.arange(len(R)).float())
+    return ViewBatch(torch.cat([rgb for _, rgb in views]), silhouettes, R, T, torch.arange(len(R)).float())
 
 
 class SingleView(LightningDataModule):
@@ -136,9 +144,8 @@ class PhotoView(SingleView):
         rgba = _fit_into(torch.cat([rgb, self.mask[..., None]], dim=-1), self.scene.image_size)
         rgb = rgba[..., :3] + background * (1 - rgba[..., 4:])  # outside the photograph
         self.target = ViewBatch(
-            rgb[None], rgba[None, ..., 3], torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool),
-            torch.zeros(1),
-        )  # fmt: skip
+            rgb[None], rgba[None, ..., 3], torch.full((1, 3, 3), torch.nan), torch.full((1, 3), torch.nan), torch.zeros(1)
+        )
 
 
 def read_photo(image: str | Path, mask: str | Path | None = None) -> tuple[Tensor, Tensor]:

@@ -26,6 +26,11 @@ class PosePrediction(TensorRecord):
     R: Float[Tensor, "B 3 3"]
     T: Float[Tensor, "B 3"]
 
+    @property
+    def position(self) -> Tensor:
+        """Where the cameras stand in the world: (B, 3)."""
+        return camera_centre(self.R, self.T)
+
 
 class CameraPose(nn.Module, ABC):
     """One camera: base pose R, T (buffers) and the step `delta` (P,) from it, which is learned."""

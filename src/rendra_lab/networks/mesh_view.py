@@ -18,6 +18,8 @@ from rendra.renderer import (
     RasterizationSettings,
     SoftPhongShader,
     SoftSilhouetteShader,
+    opencv_from_cameras,
+    opengl_from_cameras,
 )
 from rendra.structures import Meshes
 
@@ -68,7 +70,7 @@ class MeshView(nn.Module):
         """
         self._follow(R.device)
         size, sigma = image_size or self.image_size, sigma or self.sigma
-        cameras = FoVPerspectiveCameras(R=R, T=T, fov=self.fov_deg, aspect_ratio=1.0, device=R.device)
+        cameras = self.cameras(R, T)
         meshes = self.mesh.extend(len(R)) if len(R) > 1 else self.mesh
         blend = BlendParams(sigma=sigma, gamma=1e-4, background_color=self.background)
         reach = math.log(1 / _NEGLIGIBLE - 1) * sigma
@@ -82,6 +84,22 @@ class MeshView(nn.Module):
         )
         colours = MeshRenderer(MeshRasterizer(cameras, settings), shader)
         return outline(meshes)[..., 3], colours(meshes)[..., :3]
+
+    def cameras(self, R: Tensor, T: Tensor) -> FoVPerspectiveCameras:
+        """The cameras of poses R (B, 3, 3), T (B, 3) with this view's intrinsics."""
+        return FoVPerspectiveCameras(R=R, T=T, fov=self.fov_deg, aspect_ratio=1.0, device=R.device)
+
+    def describe_camera(self, R: Tensor, T: Tensor) -> dict[str, Any]:
+        """One camera R (3, 3), T (3,) in the conventions of this library, of OpenCV and of OpenGL/Blender, as lists."""
+        cameras, size = self.cameras(R[None], T[None]), torch.tensor([self.image_size])
+        opencv, opengl = opencv_from_cameras(cameras, size), opengl_from_cameras(cameras, size)
+        return {
+            "image_size_hw_px": list(self.image_size),
+            "fov_deg": self.fov_deg,
+            "rendra": {"R": R.tolist(), "T": T.tolist()},
+            "opencv": {"R": opencv.R[0].tolist(), "tvec": opencv.tvec[0].tolist(), "K": opencv.camera_matrix[0].tolist()},
+            "opengl": {"camera_to_world": opengl.camera_to_world[0].tolist()},
+        }
 
     def _follow(self, device: torch.device) -> None:
         if self.mesh.device != device:

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from rendra_lab.base_task import Task
-from rendra_lab.data.views import ViewBatch, shrink
+from rendra_lab.camera_starts import GivenStart, MultiStart
+from rendra_lab.data.views import ViewBatch
 from rendra_lab.networks.camera_pose import CameraPose, PosePrediction
 from rendra_lab.networks.mesh_view import MeshView
-from rendra_lab.tasks.pose.start import GivenStart, MultiStart
 from rendra_lab.visualization import silhouette_overlay
 
 
@@ -52,20 +52,10 @@ class Pose(Task[ViewBatch, PosePrediction]):
         if bool(self.pose.is_placed):
             return
         target = self.trainer.datamodule.target.to(self.device)  # type: ignore[attr-defined]
-        R, T = self.start(self.scene, self.pose, target, self.compare)
+        R, T = self.start(self.scene, self.pose, target, self.residuals_of)
         self.pose.place(R, T)
         self.start_R.copy_(R)
         self.start_T.copy_(T)
-
-    def compare(self, R: Tensor, T: Tensor, target: ViewBatch, size: tuple[int, int], sigma: float) -> Tensor:
-        """Residual vectors (M, D) of the poses R (M, 3, 3), T (M, 3) against one target.
-
-        The mesh is rendered at `size` with the edge `sigma`, then shrunk to the target's size: a smooth function.
-        """
-        silhouettes, colours = self.scene(R, T, size, sigma)
-        colours, silhouettes = shrink(colours, silhouettes, (target.rgb.shape[1], target.rgb.shape[2]))
-        seen = [PosePrediction(*(x[i : i + 1] for x in (colours, silhouettes, R, T))) for i in range(len(R))]
-        return torch.stack([self.residuals_of(one, target) for one in seen])
 
     def panels(self, prediction: PosePrediction, batch: ViewBatch) -> dict[str, Tensor]:
         """Target, start, the fit now, and where the two outlines differ."""
@@ -76,3 +66,7 @@ class Pose(Task[ViewBatch, PosePrediction]):
             "fit": prediction.rgb[0],
             "difference": silhouette_overlay(prediction.silhouette[0], batch.silhouette[0]),
         }
+
+    def facts(self, prediction: PosePrediction, batch: ViewBatch) -> dict[str, Any]:
+        """The camera, for other programs: `camera.json`."""
+        return {"camera": self.scene.describe_camera(prediction.R[0], prediction.T[0])}

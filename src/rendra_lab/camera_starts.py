@@ -1,4 +1,4 @@
-"""Where a pose fit begins: at a given camera, or at the best of many after a coarse search."""
+"""Where a camera fit begins: at a given place, or at the best of many after a coarse search."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ import torch
 from torch import Tensor
 
 from rendra.transforms import euler_angles_to_matrix
-from rendra_lab.data.views import ViewBatch
-from rendra_lab.networks.camera_pose import CameraPose, SixDofPose, look_at_origin
+from rendra_lab.data.views import ViewBatch, shrink
+from rendra_lab.networks.camera_pose import CameraPose, PosePrediction, SixDofPose, look_at_origin
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.optimizers import levenberg_marquardt_step
 
-Compare = Callable[[Tensor, Tensor, ViewBatch, tuple[int, int], float], Tensor]
-"""Poses R (M, 3, 3), T (M, 3), one target, a size to render at and an edge sigma -> residual vectors (M, D)."""
+Residuals = Callable[[PosePrediction, ViewBatch], Tensor]
+"""A task's `residuals_of`: one prediction, one target of the same size -> a vector (D,)."""
+
+
+Comparison = Callable[[Tensor, Tensor], Tensor]
+"""Poses R (M, 3, 3), T (M, 3) -> residual vectors (M, D)."""
 
 
 class Level(NamedTuple):
@@ -40,7 +44,9 @@ class GivenStart:
             raise ValueError(f"a start position has three coordinates and is not the origin, got {list(position)}")
         self.position = [float(x) for x in position]
 
-    def __call__(self, scene: MeshView, pose: CameraPose, target: ViewBatch, compare: Compare) -> tuple[Tensor, Tensor]:
+    def __call__(
+        self, scene: MeshView, pose: CameraPose, target: ViewBatch, residuals: Residuals
+    ) -> tuple[Tensor, Tensor]:
         """The pose R (1, 3, 3), T (1, 3)."""
         return look_at_origin(torch.tensor([self.position], device=target.rgb.device))
 
@@ -77,8 +83,10 @@ class MultiStart:
         self.at_once = at_once
 
     @torch.no_grad()
-    def __call__(self, scene: MeshView, pose: CameraPose, target: ViewBatch, compare: Compare) -> tuple[Tensor, Tensor]:
-        """The best pose R (1, 3, 3), T (1, 3).
+    def __call__(
+        self, scene: MeshView, pose: CameraPose, target: ViewBatch, residuals: Residuals
+    ) -> tuple[Tensor, Tensor]:
+        """The best pose R (1, 3, 3), T (1, 3), by the task's own residuals.
 
         Raises:
             ValueError: the target's silhouette is empty.
@@ -87,19 +95,24 @@ class MultiStart:
             raise ValueError("the target's silhouette is empty: there is no pose to find")
         R, T = self._hypotheses(scene, pose, target.resized(_scaled(scene, self.levels[0].side_px)))
         for level in self.levels:
-            residuals = self._residuals(scene, target, level, compare)
-            best = residuals(R, T).square().sum(-1).argsort()[: level.kept]
-            R, T = self._refine(pose, R[best], T[best], residuals, level.steps)
-        best = residuals(R, T).square().sum(-1).argmin()
+            compare = self._comparison(scene, target, level, residuals)
+            best = compare(R, T).square().sum(-1).argsort()[: level.kept]
+            R, T = self._refine(pose, R[best], T[best], compare, level.steps)
+        best = compare(R, T).square().sum(-1).argmin()
         return R[best][None], T[best][None]
 
-    def _residuals(
-        self, scene: MeshView, target: ViewBatch, level: Level, compare: Compare
-    ) -> Callable[[Tensor, Tensor], Tensor]:
-        """The comparison of any number of poses at one level; its edge is as many pixels wide as at full size."""
+    def _comparison(self, scene: MeshView, target: ViewBatch, level: Level, residuals: Residuals) -> Comparison:
+        """Renders poses at one level's size, the edge as many pixels wide as at full size, and shrinks the images."""
         size, shrunk = _scaled(scene, level.side_px), target.resized(_scaled(scene, level.shrunk_px))
         sigma = scene.sigma * (min(scene.image_size) / min(size)) ** 2
-        return lambda R, T: self._chunked(lambda R, T: compare(R, T, shrunk, size, sigma), R, T)
+
+        def compare(R: Tensor, T: Tensor) -> Tensor:
+            silhouettes, colours = scene(R, T, size, sigma)
+            seen = shrink(colours, silhouettes, (shrunk.rgb.shape[1], shrunk.rgb.shape[2]))
+            rows = zip(*(x.split(1) for x in (*seen, R, T)), strict=True)
+            return torch.stack([residuals(PosePrediction(*row), shrunk) for row in rows])
+
+        return lambda R, T: self._chunked(compare, R, T)
 
     def _hypotheses(self, scene: MeshView, pose: CameraPose, target: ViewBatch) -> tuple[Tensor, Tensor]:
         """Poses all around the mesh, as far and as shifted as their silhouettes say."""
@@ -122,7 +135,7 @@ class MultiStart:
         return R, T
 
     def _refine(
-        self, pose: CameraPose, R: Tensor, T: Tensor, residuals: Callable[[Tensor, Tensor], Tensor], steps: int
+        self, pose: CameraPose, R: Tensor, T: Tensor, compare: Comparison, steps: int
     ) -> tuple[Tensor, Tensor]:
         """Levenberg-Marquardt on all poses side by side."""
         delta, damping = R.new_zeros(len(R), pose.degrees_of_freedom), R.new_full((len(R),), 1e-2)
@@ -130,7 +143,7 @@ class MultiStart:
         def moved(delta: Tensor) -> Tensor:
             tried = delta.shape[1]
             bases = R.repeat_interleave(tried, 0), T.repeat_interleave(tried, 0)
-            return residuals(*pose.retract(*bases, delta.flatten(0, 1))).unflatten(0, (len(R), tried))
+            return compare(*pose.retract(*bases, delta.flatten(0, 1))).unflatten(0, (len(R), tried))
 
         longest = 0.2 * float(T.norm(dim=1).mean())
         for _ in range(steps):

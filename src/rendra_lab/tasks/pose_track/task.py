@@ -1,0 +1,80 @@
+"""The camera through a sequence of frames of a known mesh: each fit starts from the last frame's pose.
+
+Shapes: B cameras (one at a time), N frames, H W image.  Poses: x_view = x_world @ R + T.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rendra_lab.base_task import Task
+from rendra_lab.camera_starts import GivenStart, MultiStart
+from rendra_lab.data.views import ViewBatch
+from rendra_lab.networks.camera_pose import CameraPose, PosePrediction
+from rendra_lab.networks.mesh_view import MeshView
+from rendra_lab.visualization import silhouette_overlay
+
+
+class PoseTrack(Task[ViewBatch, PosePrediction]):
+    """Follow one camera.
+
+    Args:
+        scene: the known mesh, intrinsics and lights; shared with the data.
+        pose: the camera to learn.
+        start: says where to begin in the first frame.
+        frames: number of frames N.
+        **parts: losses, metrics, optimizer, scheduler of `Task`.
+    """
+
+    track_R: Tensor
+    track_T: Tensor
+    frame: Tensor
+
+    def __init__(self, scene: MeshView, pose: CameraPose, start: GivenStart | MultiStart, frames: int, **parts: Any) -> None:
+        super().__init__(**parts)
+        self.scene = scene
+        self.pose = pose
+        self.start = start
+        self.register_buffer("track_R", torch.eye(3).repeat(frames, 1, 1))
+        self.register_buffer("track_T", torch.zeros(frames, 3))
+        self.register_buffer("frame", torch.tensor(0))
+
+    def predict(self, batch: ViewBatch) -> PosePrediction:
+        """The frame in work from the camera as it stands, any other one from its finished pose."""
+        frame = int(batch.frame)
+        R, T = self.pose() if frame == int(self.frame) else (self.track_R[frame, None], self.track_T[frame, None])
+        silhouette, rgb = self.scene(R, T)
+        return PosePrediction(rgb, silhouette, R, T)
+
+    def on_fit_start(self) -> None:
+        """Lightning's hook: places the camera in the first frame, unless a checkpoint did."""
+        if not bool(self.pose.is_placed):
+            target = self.trainer.datamodule.target.to(self.device)  # type: ignore[attr-defined]
+            self.pose.place(*self.start(self.scene, self.pose, target, self.residuals_of))
+
+    def on_train_batch_start(self, batch: ViewBatch, batch_idx: int) -> None:
+        """Lightning's hook: a new frame starts from the pose of the last."""
+        if int(batch.frame) != int(self.frame):
+            self.pose.place(*(x.detach() for x in self.pose()))
+            self.frame.fill_(int(batch.frame))
+            for optimizer in self.trainer.optimizers:
+                optimizer.state = defaultdict(dict)  # what it knew was the last frame's
+        super().on_train_batch_start(batch, batch_idx)
+
+    def on_train_batch_end(self, outputs: Any, batch: ViewBatch, batch_idx: int) -> None:
+        """Lightning's hook: notes the frame's pose."""
+        R, T = self.pose()
+        self.track_R[int(batch.frame)] = R[0].detach()
+        self.track_T[int(batch.frame)] = T[0].detach()
+
+    def panels(self, prediction: PosePrediction, batch: ViewBatch) -> dict[str, Tensor]:
+        """Target, fit, and where the two outlines differ."""
+        return {
+            "target": batch.rgb[0],
+            "fit": prediction.rgb[0],
+            "difference": silhouette_overlay(prediction.silhouette[0], batch.silhouette[0]),
+        }
