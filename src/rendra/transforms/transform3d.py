@@ -296,7 +296,7 @@ class RotateAxisAngle(Rotate):
         angle: a number, (N,) tensor, or array.
         axis: "X", "Y" or "Z", in either case.
         degrees: the angle's unit; False means radians.
-        dtype: of the matrix. The default is PyTorch3D's; transformed points keep their own dtype.
+        dtype: of the matrix; by default that of a floating-point tensor given, else float32.
         device: by default where the angle lies, else the CPU.
 
     Raises:
@@ -308,12 +308,14 @@ class RotateAxisAngle(Rotate):
         angle: Any,
         axis: str = "X",
         degrees: bool = True,
-        dtype: torch.dtype = torch.float64,
+        dtype: torch.dtype | None = None,
         device: Device | None = None,
     ) -> None:
         axis = axis.upper()
         if axis not in ("X", "Y", "Z"):
             raise ValueError(f"Expected axis to be one of ['X', 'Y', 'Z']; got {axis!r}")
+        if dtype is None:
+            dtype = angle.dtype if isinstance(angle, Tensor) and angle.is_floating_point() else torch.float32
         angles = torch.as_tensor(angle, dtype=dtype, device=get_device(angle, device))
         if angles.dim() > 1:
             raise ValueError(f"Expected angle to be a number or of shape (N,); got {tuple(angles.shape)}")

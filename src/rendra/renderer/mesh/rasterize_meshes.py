@@ -28,6 +28,8 @@ def rasterize_meshes(
     cull_backfaces: bool = False,
     z_clip_value: float | None = None,
     cull_to_frustum: bool = False,
+    *,
+    verts_divided_by_depth: bool | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Find the faces that each pixel sees.
 
@@ -46,6 +48,8 @@ def rasterize_meshes(
         cull_backfaces: leave out faces whose corners run clockwise in the image.
         z_clip_value: cut faces at this view depth and drop what is nearer; None cuts nothing.
         cull_to_frustum: drop faces that lie wholly outside the image before they are rasterised.
+        verts_divided_by_depth: whether the vertices come from a perspective camera, which decides where a cut at
+            `z_clip_value` falls; None takes `perspective_correct`.
 
     Returns:
         pix_to_face (N, H, W, K) int64, index of the packed face, nearest first; zbuf (N, H, W, K), view depth;
@@ -56,7 +60,8 @@ def rasterize_meshes(
         ValueError: sizes, radius or number of faces that cannot be.
     """
     size = parse_image_size(image_size)
-    clipped = _prepare(meshes, size, blur_radius, perspective_correct, z_clip_value, cull_to_frustum)
+    divided = perspective_correct if verts_divided_by_depth is None else verts_divided_by_depth
+    clipped = _prepare(meshes, size, blur_radius, divided, z_clip_value, cull_to_frustum)
     pix_to_face, zbuf, bary, dists = _rasterize_kernel(
         *_kernel_faces(clipped),
         size,
@@ -75,17 +80,17 @@ def rasterize_silhouette(
     image_size: int | Sequence[int] = 256,
     blur_radius: float = 0.0,
     sigma: float = 1e-4,
-    perspective_correct: bool = False,
     cull_backfaces: bool = False,
     z_clip_value: float | None = None,
     cull_to_frustum: bool = False,
+    *,
+    verts_divided_by_depth: bool = False,
 ) -> Tensor:
     """Alpha of `sigmoid_alpha_blend` over all faces of a pixel, however many, without storing fragments.
 
     Args:
         meshes: as in `rasterize_meshes`, and so are all arguments but these:
         sigma: width of the edge, in squared NDC.
-        perspective_correct: whether vertices were divided by depth; of use to clipping only.
 
     Returns:
         alpha (N, H, W) in [0, 1].
@@ -94,15 +99,28 @@ def rasterize_silhouette(
         ValueError: sizes, radius or sigma that cannot be.
     """
     size = parse_image_size(image_size)
-    clipped = _prepare(meshes, size, blur_radius, perspective_correct, z_clip_value, cull_to_frustum)
+    clipped = _prepare(meshes, size, blur_radius, verts_divided_by_depth, z_clip_value, cull_to_frustum)
     return _silhouette_kernel(*_kernel_faces(clipped), size, blur_radius, sigma, cull_backfaces)
+
+
+def non_square_ndc_range(S1: int, S2: int) -> float:
+    """How much of NDC the side of S1 pixels spans, beside a side of S2: 2 if it is the shorter one."""
+    return 2.0 * S1 / min(S1, S2)
+
+
+def pix_to_non_square_ndc(i: int | Tensor, S1: int, S2: int) -> float | Tensor:
+    """NDC of the centre of pixel i along a side of S1 pixels, beside a side of S2.
+
+    Pixels count with the axis here, from its negative end; columns and rows of images count against it.
+    """
+    return non_square_ndc_range(S1, S2) * ((2 * i + 1) / S1 - 1) / 2
 
 
 def _prepare(
     meshes: Meshes,
     image_size: tuple[int, int],
     blur_radius: float,
-    perspective_correct: bool,
+    verts_divided_by_depth: bool,
     z_clip_value: float | None,
     cull_to_frustum: bool,
 ) -> ClippedFaces:
@@ -118,7 +136,7 @@ def _prepare(
         right=half_width,
         top=-half_height,
         bottom=half_height,
-        perspective_correct=perspective_correct,
+        perspective_correct=verts_divided_by_depth,
         cull=cull_to_frustum,
         z_clip_value=z_clip_value,
     )

@@ -112,11 +112,15 @@ class MeshRasterizer(nn.Module):
             **kwargs: as of `transform`, and `raster_settings` to replace those of this rasterizer.
         """
         settings = kwargs.get("raster_settings", self.raster_settings)
+        shared = self._shared_arguments(settings, kwargs)
+        if (perspective_correct := settings.perspective_correct) is None:
+            perspective_correct = shared["verts_divided_by_depth"]
         pix_to_face, zbuf, bary_coords, dists = rasterize_meshes(
             self.transform(meshes_world, **kwargs),
             faces_per_pixel=settings.faces_per_pixel,
+            perspective_correct=perspective_correct,
             clip_barycentric_coords=_clips_barycentric(settings),
-            **self._shared_arguments(settings, kwargs),
+            **shared,
         )
         return Fragments(pix_to_face, zbuf, bary_coords, dists)
 
@@ -151,12 +155,10 @@ class MeshRasterizer(nn.Module):
         return {
             "image_size": settings.image_size,
             "blur_radius": settings.blur_radius,
-            "perspective_correct": perspective
-            if settings.perspective_correct is None
-            else settings.perspective_correct,
             "cull_backfaces": settings.cull_backfaces,
             "z_clip_value": z_clip,
             "cull_to_frustum": settings.cull_to_frustum,
+            "verts_divided_by_depth": perspective,
         }
 
 

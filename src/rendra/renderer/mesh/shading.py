@@ -122,6 +122,7 @@ def _light_rows(
         What multiplies the texture, ambient + diffuse, and what is added to it, specular; (M, C) or (1, C) each.
     """
     camera_position = cameras.get_camera_center()
+    _check_batches(len(counts), lights=len(lights), materials=len(materials), cameras=len(camera_position))
     # what is the same for all images needs no padding to images
     is_shared = max(len(lights), len(materials), len(camera_position)) <= 1
     rows = None if is_shared else ragged(counts)
@@ -139,6 +140,15 @@ def _light_rows(
     )
     tint = ambient + diffuse
     return (tint[0], specular[0]) if rows is None else (rows.take(tint), rows.take(specular))
+
+
+def _check_batches(num_meshes: int, **sizes: int) -> None:
+    """Raises ValueError unless there is one light, material and camera for all meshes, or one for each."""
+    if any(size not in (1, num_meshes) for size in sizes.values()):
+        given = ", ".join(f"{size} {name}" for name, size in sizes.items())
+        raise ValueError(
+            f"Got {given} for {num_meshes} meshes: give one of each kind for all meshes, or one for each"
+        )
 
 
 def _reflected(reflectance: Tensor, light: Tensor) -> Tensor:

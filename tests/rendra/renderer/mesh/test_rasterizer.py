@@ -89,18 +89,27 @@ def test_the_nearest_surface_of_a_sphere_is_seen() -> None:
 def test_open_settings_follow_the_camera() -> None:
     seen = MeshRasterizer(FoVPerspectiveCameras(znear=torch.tensor([2.0, 0.4])))
     arguments = seen._shared_arguments(seen.raster_settings, {})
-    assert arguments["perspective_correct"] is True
+    assert arguments["verts_divided_by_depth"] is True
     assert arguments["z_clip_value"] == pytest.approx(0.2)
     flat = MeshRasterizer(FoVOrthographicCameras())
     arguments = flat._shared_arguments(flat.raster_settings, {})
-    assert arguments["perspective_correct"] is False
+    assert arguments["verts_divided_by_depth"] is False
     assert arguments["z_clip_value"] is None
     plain = MeshRasterizer(PerspectiveCameras())
     assert plain._shared_arguments(plain.raster_settings, {})["z_clip_value"] is None
-    settings = RasterizationSettings(perspective_correct=False, z_clip_value=0.7)
-    arguments = seen._shared_arguments(settings, {})
-    assert arguments["perspective_correct"] is False
-    assert arguments["z_clip_value"] == 0.7
+    settings = RasterizationSettings(z_clip_value=0.7)
+    assert seen._shared_arguments(settings, {})["z_clip_value"] == 0.7
+
+
+def test_faces_are_cut_in_space_whatever_the_interpolation() -> None:
+    """A floor that runs under the camera ends at the horizon, also where depth is interpolated on the image."""
+    corners = [(-20.0, -1.0, -20.0), (20.0, -1.0, -20.0), (20.0, -1.0, 20.0), (-20.0, -1.0, 20.0)]
+    floor = Meshes([torch.tensor(corners)], [torch.tensor([[0, 1, 2], [0, 2, 3]])])
+    for perspective_correct in (True, False):
+        settings = RasterizationSettings(16, perspective_correct=perspective_correct)
+        seen = MeshRasterizer(FoVPerspectiveCameras(), settings)(floor).pix_to_face[0, ..., 0] >= 0
+        assert not seen[:8].any()
+        assert seen[9:].all()
 
 
 @pytest.mark.parametrize(("blur", "clip", "outside"), [(0.05, None, False), (0.05, False, True), (0.0, True, False)])

@@ -1,0 +1,345 @@
+"""The names, module paths and signatures that scripts written for PyTorch3D 0.7.9 rely on: the rendering side."""
+
+import importlib
+import inspect
+from typing import Any
+
+import pytest
+import torch
+
+from rendra.io.obj_io import Faces, Properties
+
+NAMES = {
+    "rendra.common.datatypes": "Device get_device make_device",
+    "rendra.transforms": """
+        Rotate RotateAxisAngle Scale Transform3d Translate acos_linear_extrapolation axis_angle_to_matrix
+        axis_angle_to_quaternion euler_angles_to_matrix matrix_to_axis_angle matrix_to_euler_angles
+        matrix_to_quaternion matrix_to_rotation_6d quaternion_apply quaternion_invert quaternion_multiply
+        quaternion_raw_multiply quaternion_to_axis_angle quaternion_to_matrix random_quaternions random_rotation
+        random_rotations rotation_6d_to_matrix se3_exp_map se3_log_map so3_exp_map so3_exponential_map so3_log_map
+        so3_relative_angle so3_rotation_angle standardize_quaternion""",
+    "rendra.transforms.math": "acos_linear_extrapolation",
+    "rendra.transforms.rotation_conversions": "euler_angles_to_matrix matrix_to_quaternion rotation_6d_to_matrix",
+    "rendra.transforms.se3": "se3_exp_map se3_log_map",
+    "rendra.transforms.so3": """
+        hat hat_inv so3_exp_map so3_exponential_map so3_log_map so3_relative_angle so3_rotation_angle""",
+    "rendra.transforms.transform3d": "Rotate RotateAxisAngle Scale Transform3d Translate",
+    "rendra.structures": """
+        Meshes join_meshes_as_batch join_meshes_as_scene list_to_packed list_to_padded packed_to_list
+        padded_to_list""",
+    "rendra.structures.meshes": "Meshes join_meshes_as_batch join_meshes_as_scene",
+    "rendra.structures.utils": "list_to_packed list_to_padded packed_to_list padded_to_list padded_to_packed",
+    "rendra.io": "IO load_obj load_objs_as_meshes load_ply save_obj save_ply",
+    "rendra.io.mtl_io": "load_mtl make_mesh_texture_atlas",
+    "rendra.io.obj_io": "load_obj load_objs_as_meshes save_obj",
+    "rendra.io.pluggable": "IO",
+    "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
+    "rendra.io.ply_io": "load_ply save_ply",
+    "rendra.ops": "SubdivideMeshes interpolate_face_attributes",
+    "rendra.ops.interp_face_attrs": "interpolate_face_attributes",
+    "rendra.ops.subdivide_meshes": "SubdivideMeshes",
+    "rendra.utils": "cameras_from_opencv_projection ico_sphere opencv_from_cameras_projection torus",
+    "rendra.utils.camera_conversions": "cameras_from_opencv_projection opencv_from_cameras_projection",
+    "rendra.utils.ico_sphere": "ico_sphere",
+    "rendra.utils.torus": "torus",
+    "rendra.renderer": """
+        AmbientLights BlendParams DirectionalLights FishEyeCameras FoVOrthographicCameras FoVPerspectiveCameras
+        HardDepthShader HardFlatShader HardGouraudShader HardPhongShader Materials MeshRasterizer MeshRenderer
+        MeshRendererWithFragments OpenGLOrthographicCameras OpenGLPerspectiveCameras OrthographicCameras
+        PerspectiveCameras PointLights RasterizationSettings SfMOrthographicCameras SfMPerspectiveCameras
+        SoftDepthShader SoftGouraudShader SoftPhongShader SoftSilhouetteShader SplatterPhongShader TensorProperties
+        TexturesAtlas TexturesUV TexturesVertex camera_position_from_spherical_angles
+        convert_to_tensors_and_broadcast diffuse get_world_to_view_transform gouraud_shading hard_rgb_blend
+        look_at_rotation look_at_view_transform ndc_grid_sample ndc_to_grid_sample_coords phong_shading
+        rasterize_meshes rotate_on_spot sigmoid_alpha_blend softmax_rgb_blend specular""",
+    "rendra.renderer.blending": "BlendParams hard_rgb_blend sigmoid_alpha_blend softmax_rgb_blend",
+    "rendra.renderer.camera_utils": "camera_to_eye_at_up join_cameras_as_batch rotate_on_spot",
+    "rendra.renderer.cameras": """
+        CamerasBase FoVOrthographicCameras FoVPerspectiveCameras OrthographicCameras PerspectiveCameras
+        camera_position_from_spherical_angles get_ndc_to_screen_transform get_screen_to_ndc_transform
+        get_world_to_view_transform look_at_rotation look_at_view_transform try_get_projection_transform""",
+    "rendra.renderer.fisheyecameras": "FishEyeCameras",
+    "rendra.renderer.lighting": "AmbientLights DirectionalLights PointLights diffuse specular",
+    "rendra.renderer.materials": "Materials",
+    "rendra.renderer.splatter_blend": "SplatterBlender",
+    "rendra.renderer.utils": """
+        TensorAccessor TensorProperties convert_to_tensors_and_broadcast format_tensor ndc_grid_sample
+        ndc_to_grid_sample_coords parse_image_size""",
+    "rendra.renderer.mesh": """
+        HardPhongShader MeshRasterizer MeshRenderer RasterizationSettings SoftPhongShader SoftSilhouetteShader
+        TexturesAtlas TexturesUV TexturesVertex gouraud_shading phong_shading rasterize_meshes""",
+    "rendra.renderer.mesh.clip": """
+        ClipFrustum ClippedFaces clip_faces convert_clipped_rasterization_to_original_faces""",
+    "rendra.renderer.mesh.rasterize_meshes": "non_square_ndc_range pix_to_non_square_ndc rasterize_meshes",
+    "rendra.renderer.mesh.rasterizer": "Fragments MeshRasterizer RasterizationSettings",
+    "rendra.renderer.mesh.renderer": "MeshRenderer MeshRendererWithFragments",
+    "rendra.renderer.mesh.shader": """
+        HardDepthShader HardFlatShader HardGouraudShader HardPhongShader ShaderBase SoftDepthShader
+        SoftGouraudShader SoftPhongShader SoftSilhouetteShader SplatterPhongShader""",
+    "rendra.renderer.mesh.shading": "flat_shading gouraud_shading phong_shading",
+    "rendra.renderer.mesh.textures": "TexturesAtlas TexturesBase TexturesUV TexturesVertex",
+    "rendra.renderer.mesh.utils": "Rectangle PackedRectangle PackedRectangles pack_rectangles pack_unique_rectangles",
+}
+
+_LIGHT = "ambient_color=((0.5, 0.5, 0.5),), diffuse_color=((0.3, 0.3, 0.3),), specular_color=((0.2, 0.2, 0.2),)"
+_SHADER = "device='cpu', cameras=None, lights=None, materials=None, blend_params=None"
+
+# "..." stands for a default that is a tensor, or, for the dtype of transforms, differs on purpose: there the
+# tensors that are given keep theirs.
+SIGNATURES = {
+    "rendra.transforms": {
+        "Transform3d": "dtype=torch.float32, device='cpu', matrix=None",
+        "Transform3d.compose": "self, *others",
+        "Transform3d.inverse": "self, invert_composed=False",
+        "Transform3d.stack": "self, *others",
+        "Transform3d.transform_points": "self, points, eps=None",
+        "Transform3d.transform_normals": "self, normals",
+        "Transform3d.get_se3_log": "self, eps=1e-4, cos_bound=1e-4",
+        "Transform3d.to": "self, device, copy=False, dtype=None",
+        "Translate": "x, y=None, z=None, dtype=..., device=None",
+        "Scale": "x, y=None, z=None, dtype=..., device=None",
+        "Rotate": "R, dtype=..., device=None, orthogonal_tol=1e-5",
+        "RotateAxisAngle": "angle, axis='X', degrees=True, dtype=..., device=None",
+        "acos_linear_extrapolation": "x, bounds=(-0.9999, 0.9999)",
+        "axis_angle_to_matrix": "axis_angle, fast=False",
+        "matrix_to_axis_angle": "matrix, fast=False",
+        "euler_angles_to_matrix": "euler_angles, convention",
+        "matrix_to_euler_angles": "matrix, convention",
+        "quaternion_apply": "quaternion, point",
+        "random_quaternions": "n, dtype=None, device=None",
+        "random_rotations": "n, dtype=None, device=None",
+        "random_rotation": "dtype=None, device=None",
+        "rotation_6d_to_matrix": "d6",
+        "se3_exp_map": "log_transform, eps=1e-4",
+        "se3_log_map": "transform, eps=1e-4, cos_bound=1e-4",
+        "so3_exp_map": "log_rot, eps=1e-4",
+        "so3_log_map": "R, eps=1e-4, cos_bound=1e-4",
+        "so3_relative_angle": "R1, R2, cos_angle=False, cos_bound=1e-4, eps=1e-4",
+        "so3_rotation_angle": "R, eps=1e-4, cos_angle=False, cos_bound=1e-4",
+    },
+    "rendra.structures.meshes": {
+        "Meshes": "verts, faces, textures=None, *, verts_normals=None",
+        "Meshes.to": "self, device, copy=False",
+        "Meshes.extend": "self, N",
+        "Meshes.get_mesh_verts_faces": "self, index",
+        "Meshes.offset_verts": "self, vert_offsets_packed",
+        "Meshes.offset_verts_": "self, vert_offsets_packed",
+        "Meshes.scale_verts": "self, scale",
+        "Meshes.scale_verts_": "self, scale",
+        "Meshes.update_padded": "self, new_verts_padded",
+        "Meshes.split": "self, split_sizes",
+        "Meshes.submeshes": "self, face_indices",
+        "Meshes.sample_textures": "self, fragments",
+        "join_meshes_as_batch": "meshes, include_textures=True",
+        "join_meshes_as_scene": "meshes, include_textures=True",
+    },
+    "rendra.structures.utils": {
+        "list_to_padded": "x, pad_size=None, pad_value=0.0, equisized=False",
+        "padded_to_list": "x, split_size=None",
+        "list_to_packed": "x",
+        "packed_to_list": "x, split_size",
+        "padded_to_packed": "x, split_size=None, pad_value=None",
+    },
+    "rendra.io": {
+        "load_obj": """f, load_textures=True, create_texture_atlas=False, texture_atlas_size=4,
+            texture_wrap='repeat', device='cpu', path_manager=None""",
+        "load_objs_as_meshes": """files, device=None, load_textures=True, create_texture_atlas=False,
+            texture_atlas_size=4, texture_wrap='repeat', path_manager=None""",
+        "save_obj": """f, verts, faces, decimal_places=None, path_manager=None, *, normals=None,
+            faces_normals_idx=None, verts_uvs=None, faces_uvs=None, texture_map=None""",
+        "load_ply": "f, *, path_manager=None",
+        "save_ply": "f, verts, faces=None, verts_normals=None, ascii=False, decimal_places=None, path_manager=None",
+        "IO": "include_default_formats=True, path_manager=None",
+        "IO.load_mesh": "self, path, include_textures=True, device='cpu', **kwargs",
+        "IO.save_mesh": "self, data, path, binary=None, include_textures=True, **kwargs",
+        "IO.load_pointcloud": "self, path, device='cpu', **kwargs",
+        "IO.save_pointcloud": "self, data, path, binary=None, **kwargs",
+        "IO.register_meshes_format": "self, interpreter",
+    },
+    "rendra.io.mtl_io": {
+        "load_mtl": "f, *, material_names, data_dir, device='cpu', path_manager=None",
+        "make_mesh_texture_atlas": """material_properties, texture_images, face_material_names, faces_uvs,
+            texture_size, texture_wrap""",
+    },
+    "rendra.ops": {
+        "interpolate_face_attributes": "pix_to_face, barycentric_coords, face_attributes",
+        "SubdivideMeshes": "meshes=None",
+        "SubdivideMeshes.forward": "self, meshes, feats=None",
+    },
+    "rendra.utils": {
+        "ico_sphere": "level=0, device=None",
+        "torus": "r, R, sides, rings, device=None",
+        "cameras_from_opencv_projection": "R, tvec, camera_matrix, image_size",
+        "opencv_from_cameras_projection": "cameras, image_size",
+    },
+    "rendra.renderer": {
+        "FoVPerspectiveCameras": """znear=1.0, zfar=100.0, aspect_ratio=1.0, fov=60.0, degrees=True, R=..., T=...,
+            K=None, device='cpu'""",
+        "FoVPerspectiveCameras.compute_projection_matrix": "self, znear, zfar, fov, aspect_ratio, degrees",
+        "FoVPerspectiveCameras.unproject_points": """self, xy_depth, world_coordinates=True,
+            scaled_depth_input=False, **kwargs""",
+        "FoVOrthographicCameras": """znear=1.0, zfar=100.0, max_y=1.0, min_y=-1.0, max_x=1.0, min_x=-1.0,
+            scale_xyz=((1.0, 1.0, 1.0),), R=..., T=..., K=None, device='cpu'""",
+        "FoVOrthographicCameras.compute_projection_matrix": """self, znear, zfar, max_x, min_x, max_y, min_y,
+            scale_xyz""",
+        "PerspectiveCameras": """focal_length=1.0, principal_point=((0.0, 0.0),), R=..., T=..., K=None,
+            device='cpu', in_ndc=True, image_size=None""",
+        "PerspectiveCameras.unproject_points": "self, xy_depth, world_coordinates=True, from_ndc=False, **kwargs",
+        "PerspectiveCameras.get_principal_point": "self, **kwargs",
+        "OrthographicCameras": """focal_length=1.0, principal_point=((0.0, 0.0),), R=..., T=..., K=None,
+            device='cpu', in_ndc=True, image_size=None""",
+        "FishEyeCameras": """focal_length=..., principal_point=..., radial_params=..., tangential_params=...,
+            thin_prism_params=..., R=..., T=..., world_coordinates=False, use_radial=True, use_tangential=True,
+            use_thin_prism=True, device='cpu', image_size=None""",
+        "CamerasBase.transform_points": "self, points, eps=None, **kwargs",
+        "CamerasBase.transform_points_ndc": "self, points, eps=None, **kwargs",
+        "CamerasBase.transform_points_screen": "self, points, eps=None, with_xyflip=True, **kwargs",
+        "CamerasBase.get_camera_center": "self, **kwargs",
+        "CamerasBase.get_world_to_view_transform": "self, **kwargs",
+        "CamerasBase.get_full_projection_transform": "self, **kwargs",
+        "CamerasBase.get_ndc_camera_transform": "self, **kwargs",
+        "look_at_rotation": "camera_position, at=((0, 0, 0),), up=((0, 1, 0),), device='cpu'",
+        "look_at_view_transform": """dist=1.0, elev=0.0, azim=0.0, degrees=True, eye=None, at=((0, 0, 0),),
+            up=((0, 1, 0),), device='cpu'""",
+        "camera_position_from_spherical_angles": "distance, elevation, azimuth, degrees=True, device='cpu'",
+        "rotate_on_spot": "R, T, rotation",
+        "PointLights": f"{_LIGHT}, location=((0, 1, 0),), device='cpu'",
+        "DirectionalLights": f"{_LIGHT}, direction=((0, 1, 0),), device='cpu'",
+        "AmbientLights": "*, ambient_color=None, device='cpu'",
+        "PointLights.diffuse": "self, normals, points",
+        "PointLights.specular": "self, normals, points, camera_position, shininess",
+        "Materials": """ambient_color=((1.0, 1.0, 1.0),), diffuse_color=((1.0, 1.0, 1.0),),
+            specular_color=((1.0, 1.0, 1.0),), shininess=64, device='cpu'""",
+        "diffuse": "normals, color, direction",
+        "specular": "points, normals, direction, color, camera_position, shininess",
+        "BlendParams": "sigma=1e-4, gamma=1e-4, background_color=(1.0, 1.0, 1.0)",
+        "hard_rgb_blend": "colors, fragments, blend_params",
+        "sigmoid_alpha_blend": "colors, fragments, blend_params",
+        "softmax_rgb_blend": "colors, fragments, blend_params, znear=1.0, zfar=100",
+        "TexturesVertex": "verts_features",
+        "TexturesVertex.faces_verts_textures_packed": "self, faces_packed=None",
+        "TexturesAtlas": "atlas",
+        "TexturesUV": """maps, faces_uvs, verts_uvs, *, maps_ids=None, padding_mode='border', align_corners=True,
+            sampling_mode='bilinear'""",
+        "TexturesUV.centers_for_image": "self, index",
+        "TexturesUV.submeshes": "self, vertex_ids_list, faces_ids_list",
+        "RasterizationSettings": """image_size=256, blur_radius=0.0, faces_per_pixel=1, bin_size=None,
+            max_faces_opengl=10_000_000, max_faces_per_bin=None, perspective_correct=None,
+            clip_barycentric_coords=None, cull_backfaces=False, z_clip_value=None, cull_to_frustum=False""",
+        "MeshRasterizer": "cameras=None, raster_settings=None",
+        "MeshRasterizer.transform": "self, meshes_world, **kwargs",
+        "MeshRasterizer.forward": "self, meshes_world, **kwargs",
+        "rasterize_meshes": """meshes, image_size=256, blur_radius=0.0, faces_per_pixel=8, bin_size=None,
+            max_faces_per_bin=None, perspective_correct=False, clip_barycentric_coords=False, cull_backfaces=False,
+            z_clip_value=None, cull_to_frustum=False""",
+        "MeshRenderer": "rasterizer, shader",
+        "MeshRenderer.forward": "self, meshes_world, **kwargs",
+        "MeshRendererWithFragments": "rasterizer, shader",
+        "HardPhongShader": _SHADER,
+        "HardPhongShader.forward": "self, fragments, meshes, **kwargs",
+        "SoftPhongShader": _SHADER,
+        "HardGouraudShader": _SHADER,
+        "SoftGouraudShader": _SHADER,
+        "HardFlatShader": _SHADER,
+        "HardDepthShader": _SHADER,
+        "SoftDepthShader": _SHADER,
+        "SplatterPhongShader": "**kwargs",
+        "SoftSilhouetteShader": "blend_params=None",
+        "SoftSilhouetteShader.forward": "self, fragments, meshes, **kwargs",
+        "phong_shading": "meshes, fragments, lights, cameras, materials, texels",
+        "gouraud_shading": "meshes, fragments, lights, cameras, materials",
+        "ndc_grid_sample": "input, grid_ndc, *, align_corners=False, **grid_sample_kwargs",
+        "ndc_to_grid_sample_coords": "xy_ndc, image_size_hw",
+    },
+    "rendra.renderer.camera_utils": {
+        "camera_to_eye_at_up": "world_to_view_transform",
+        "join_cameras_as_batch": "cameras_list",
+    },
+    "rendra.renderer.cameras": {
+        "get_ndc_to_screen_transform": "cameras, with_xyflip=False, image_size=None",
+        "get_screen_to_ndc_transform": "cameras, with_xyflip=False, image_size=None",
+        "try_get_projection_transform": "cameras, cameras_kwargs",
+    },
+    "rendra.renderer.mesh.rasterizer": {"Fragments": "pix_to_face, zbuf, bary_coords, dists"},
+    "rendra.renderer.mesh.shading": {"flat_shading": "meshes, fragments, lights, cameras, materials, texels"},
+}
+
+METHODS = {
+    "rendra.transforms.Transform3d": """
+        clone compose cpu cuda get_matrix get_se3_log inverse rotate rotate_axis_angle scale stack to
+        transform_normals transform_points translate __getitem__ __len__""",
+    "rendra.structures.Meshes": """
+        clone cpu cuda detach edges_packed edges_packed_to_mesh_idx equisized extend faces_areas_packed faces_list
+        faces_normals_list faces_normals_packed faces_normals_padded faces_packed faces_packed_to_edges_packed
+        faces_packed_to_mesh_idx faces_padded get_bounding_boxes get_mesh_verts_faces has_verts_normals isempty
+        laplacian_packed mesh_to_edges_packed_first_idx mesh_to_faces_packed_first_idx
+        mesh_to_verts_packed_first_idx num_edges_per_mesh num_faces_per_mesh num_verts_per_mesh offset_verts
+        offset_verts_ sample_textures scale_verts scale_verts_ split submeshes textures to update_padded valid
+        verts_list verts_normals_list verts_normals_packed verts_normals_padded verts_packed
+        verts_packed_to_mesh_idx verts_padded verts_padded_to_packed_idx __getitem__ __len__""",
+    "rendra.renderer.CamerasBase": """
+        clone get_camera_center get_full_projection_transform get_image_size get_ndc_camera_transform
+        get_projection_transform get_world_to_view_transform get_znear in_ndc is_perspective to transform_points
+        transform_points_ndc transform_points_screen unproject_points __getitem__ __len__""",
+    "rendra.renderer.TensorProperties": "clone gather_props isempty to __getitem__ __len__",
+    "rendra.renderer.TexturesVertex": """
+        clone detach extend faces_verts_textures_packed isempty join_batch join_scene sample_textures submeshes to
+        verts_features_list verts_features_packed verts_features_padded __getitem__ __len__""",
+    "rendra.renderer.TexturesUV": """
+        centers_for_image clone detach extend faces_uvs_list faces_uvs_padded faces_verts_textures_packed join_batch
+        join_scene maps_ids_list maps_ids_padded maps_list maps_padded sample_textures submeshes to verts_uvs_list
+        verts_uvs_padded __getitem__ __len__""",
+    "rendra.renderer.TexturesAtlas": """
+        atlas_list atlas_packed atlas_padded clone detach extend faces_verts_textures_packed join_batch join_scene
+        sample_textures submeshes to __getitem__ __len__""",
+    "rendra.renderer.mesh.rasterizer.Fragments": "detach",
+}
+
+
+def _member(module: str, path: str) -> Any:
+    """The object that a dotted path names inside a module."""
+    found = importlib.import_module(module)
+    for name in path.split("."):
+        found = getattr(found, name)
+    return found
+
+
+@pytest.mark.parametrize("module", NAMES)
+def test_names_stand_where_scripts_import_them_from(module: str) -> None:
+    found = importlib.import_module(module)
+    assert [name for name in NAMES[module].split() if not hasattr(found, name)] == []
+
+
+@pytest.mark.parametrize("module", [m for m in NAMES if hasattr(importlib.import_module(m), "__all__")])
+def test_star_imports_work(module: str) -> None:
+    found = importlib.import_module(module)
+    assert [name for name in found.__all__ if not hasattr(found, name)] == []
+
+
+@pytest.mark.parametrize("owner", METHODS)
+def test_classes_have_the_members_that_scripts_use(owner: str) -> None:
+    found = _member(*owner.rsplit(".", 1))
+    assert [name for name in METHODS[owner].split() if not hasattr(found, name)] == []
+
+
+@pytest.mark.parametrize(("module", "path"), [(m, path) for m, table in SIGNATURES.items() for path in table])
+def test_signatures_take_the_same_calls(module: str, path: str) -> None:
+    """Same names, order, kinds and defaults; what is ours beside it is keyword-only and optional."""
+    arguments = " ".join(SIGNATURES[module][path].split())
+    documented = inspect.signature(eval(f"lambda {arguments}: 0", {"torch": torch}))
+    ours = dict(inspect.signature(_member(module, path)).parameters)
+    extra = [parameter for name, parameter in ours.items() if name not in documented.parameters]
+    assert all(p.kind is p.KEYWORD_ONLY and p.default is not p.empty for p in extra), extra
+    shared = [name for name in ours if name in documented.parameters]
+    assert shared == list(documented.parameters)
+    for name, parameter in documented.parameters.items():
+        assert ours[name].kind == parameter.kind, name
+        if parameter.default is ...:
+            assert ours[name].default is not parameter.empty, name
+        else:
+            assert ours[name].default == parameter.default, name
+
+
+def test_results_of_load_obj_keep_their_fields() -> None:
+    assert Faces._fields == ("verts_idx", "normals_idx", "textures_idx", "materials_idx")
+    assert Properties._fields == ("normals", "verts_uvs", "material_colors", "texture_images", "texture_atlas")
