@@ -29,7 +29,8 @@ class Repeated(Generic[BatchT]):
 
     def __iter__(self) -> Iterator[BatchT]:
         start, self._resume_at = self._resume_at, 0
-        for self._given in range(start + 1, self.times + 1):
+        for given in range(start + 1, self.times + 1):
+            self._given = given
             yield self.batch
 
     def state_dict(self) -> dict[str, int]:

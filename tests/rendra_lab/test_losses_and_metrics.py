@@ -1,0 +1,101 @@
+"""Losses and metrics against closed forms and published implementations."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from assertions import assert_close, assert_finite
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from rendra_lab import losses, metrics
+
+
+@pytest.fixture
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    target = torch.rand(2, 24, 31, 3, dtype=torch.float64)
+    return (target + 0.1 * torch.randn_like(target)).clamp(0, 1), target
+
+
+def test_psnr_is_scikit_images(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    values = [peak_signal_noise_ratio(t.numpy(), p.numpy(), data_range=1.0) for p, t in zip(*pair, strict=True)]
+    assert float(metrics.psnr(*pair)) == pytest.approx(float(np.mean(values)), abs=1e-9)
+
+
+def test_psnr_has_closed_forms() -> None:
+    zero = torch.zeros(1, 4, 4, 3)
+    assert_close(metrics.psnr(zero, zero + 0.1), 20.0, atol=1e-4)
+    assert_close(metrics.psnr(zero, zero), 100.0)
+
+
+def test_ssim_is_scikit_images(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    values = [
+        structural_similarity(
+            t.numpy(),
+            p.numpy(),
+            data_range=1.0,
+            channel_axis=-1,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+        for p, t in zip(*pair, strict=True)
+    ]
+    assert float(metrics.ssim(*pair)) == pytest.approx(float(np.mean(values)), abs=1e-9)
+    assert float(metrics.ssim(pair[1], pair[1])) == pytest.approx(1.0)
+
+
+def test_ssim_needs_a_window() -> None:
+    with pytest.raises(ValueError, match="11 x 11"):
+        metrics.ssim(torch.zeros(10, 20, 3), torch.zeros(10, 20, 3))
+
+
+def test_metrics_refuse_images_that_differ_in_shape() -> None:
+    with pytest.raises(ValueError, match="differ in shape"):
+        metrics.psnr(torch.zeros(1, 4, 4, 3), torch.zeros(1, 4, 4, 1))
+
+
+def test_iou_counts_pixels() -> None:
+    first, second = torch.zeros(2, 4, 4), torch.zeros(2, 4, 4)
+    first[0, :2] = second[0, 1:3] = 1
+    assert_close(metrics.iou(first, second), (4 / 12 + 1) / 2)  # the second pair is empty: it agrees
+    assert_close(metrics.iou(first[0], second[0]), 4 / 12)
+
+
+def test_soft_iou_agrees_with_iou_on_sharp_masks_and_survives_empty_ones() -> None:
+    first, second = torch.zeros(1, 4, 4), torch.zeros(1, 4, 4)
+    assert_close(losses.silhouette_iou(first, second), 0.0)
+    first[0, :2] = second[0, 1:3] = 1
+    assert_close(losses.silhouette_iou(first, second), 1 - metrics.iou(first, second))
+    empty = torch.zeros(1, 4, 4, requires_grad=True)
+    losses.silhouette_iou(empty, second).backward()
+    assert_finite(empty.grad)
+
+
+def test_masks_weigh_pixels_of_every_channel() -> None:
+    prediction, target = torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2, 3)
+    prediction[0, 0] = 1.0
+    mask = torch.tensor([[[0.0, 1.0], [1.0, 1.0]]])
+    for loss in (losses.SquaredError(), losses.absolute_error):
+        assert_close(loss(prediction, target, mask), 2 / 3)
+        assert_close(loss(prediction, target, torch.zeros_like(mask)), 0.0)
+
+
+def test_huber_is_a_parabola_that_becomes_a_line() -> None:
+    zero = torch.zeros(1)
+    assert_close(losses.huber(zero + 0.05, zero, delta=0.1), 0.5 * 0.05**2)
+    assert_close(losses.huber(zero + 1.0, zero, delta=0.1), 0.1 * (1 - 0.05))
+
+
+def test_cross_entropy_is_finite_at_certainty() -> None:
+    certain = torch.tensor([0.0, 1.0], requires_grad=True)
+    losses.binary_cross_entropy(certain, torch.tensor([1.0, 0.0])).backward()
+    assert_finite(certain.grad)
+    half = torch.tensor([0.5])
+    assert_close(losses.binary_cross_entropy(half, torch.tensor([1.0])), math.log(2))
+
+
+def test_the_books_silhouette_loss_is_a_sum() -> None:
+    loss = losses.SummedSquaredError()
+    assert_close(loss(torch.ones(2, 3, 3), torch.zeros(2, 3, 3)), 18.0)
+    assert loss.residuals(torch.ones(2, 3, 3), torch.zeros(2, 3, 3)).shape == (18,)

@@ -1,0 +1,59 @@
+"""Terms: which fields they read, what they weigh, and least squares."""
+
+import pytest
+import torch
+from assertions import assert_close
+from torchmetrics import MeanMetric
+
+from rendra_lab import losses, metrics
+from rendra_lab.terms import LossTerm, MetricTerm, PiecewiseLinear
+
+PREDICTION = {"rgb": torch.tensor([1.0, 2.0, 4.0]), "other": torch.tensor(3.0)}
+BATCH = {"rgb": torch.tensor([1.0, 1.0, 1.0]), "mask": torch.tensor([1.0, 1.0, 0.0])}
+
+
+def test_a_loss_reads_the_named_fields() -> None:
+    assert_close(LossTerm(losses.absolute_error)(PREDICTION, BATCH), 4 / 3)
+    assert_close(LossTerm(losses.mean_square, prediction="other", target=None)(PREDICTION, BATCH), 9.0)
+    assert_close(LossTerm(losses.absolute_error, context={"mask": "mask"})(PREDICTION, BATCH), 0.5)
+
+
+@pytest.mark.parametrize("mask", [None, {"mask": "mask"}])
+def test_squared_residuals_sum_to_the_weighted_loss(mask: dict[str, str] | None) -> None:
+    term = LossTerm(losses.SquaredError(), weight=2.5, context=mask)
+    assert_close(term.residuals(PREDICTION, BATCH).square().sum(), 2.5 * term(PREDICTION, BATCH))
+
+
+def test_residuals_are_refused_where_there_are_none() -> None:
+    with pytest.raises(TypeError, match="absolute_error is not a sum of squares"):
+        LossTerm(losses.absolute_error).residuals(PREDICTION, BATCH)
+    with pytest.raises(ValueError, match="weight of at least 0"):
+        LossTerm(losses.SquaredError(), weight=-1).residuals(PREDICTION, BATCH)
+
+
+def test_a_weight_may_follow_a_schedule() -> None:
+    term = LossTerm(losses.absolute_error, weight=[[10, 1.0], [20, 3.0], [20, 0.0], [40, 1.0]])
+    assert [term.weight_at(step) for step in (0, 10, 15, 20, 30, 99)] == [1.0, 1.0, 2.0, 0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("knots", [[], [[1]], [[5, 1.0], [4, 1.0]]])
+def test_bad_schedules_are_refused(knots: list) -> None:
+    with pytest.raises(ValueError, match="schedule"):
+        PiecewiseLinear(knots)
+
+
+def test_metrics_are_functions_or_torchmetrics() -> None:
+    assert_close(MetricTerm(metrics.mean_absolute_error)(PREDICTION, BATCH), 4 / 3)
+    mean = MetricTerm(MeanMetric(), prediction="other", target=None)
+    assert mean(PREDICTION, BATCH) is mean.fn
+    assert float(mean.fn.compute()) == 3.0
+
+
+def test_a_metric_is_never_differentiated() -> None:
+    prediction = {"rgb": torch.ones(3, requires_grad=True)}
+    assert not MetricTerm(metrics.mean_absolute_error)(prediction, BATCH).requires_grad
+
+
+def test_a_term_needs_something_to_call() -> None:
+    with pytest.raises(TypeError, match="got int"):
+        LossTerm(3)  # type: ignore[arg-type]
