@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
-import importlib
-import inspect
 import logging
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -23,6 +21,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from lightning.pytorch.utilities.model_helpers import is_overridden
 from omegaconf import DictConfig, OmegaConf, read_write
 
@@ -31,23 +30,9 @@ from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import StepTimer
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
+from rendra_lab.targets import check_targets
 
 log = logging.getLogger(__name__)
-
-# A configuration may come from anywhere, and `_target_` calls what it names: only these are called.
-_ALLOWED_TARGETS = (
-    "rendra",
-    "rendra_lab",
-    "lightning.pytorch.Trainer",
-    "lightning.pytorch.callbacks",
-    "lightning.pytorch.plugins",
-    "lightning.pytorch.profilers",
-    "lightning.pytorch.strategies",
-    "torch.nn",
-    "torch.optim",
-    "torchmetrics",
-)
-_ALLOWED_HOMES = ("rendra", "rendra_lab", "lightning.pytorch", "torch.nn", "torch.optim", "torchmetrics")
 
 # What Lightning says that a user can do nothing about.
 _IDLE_WARNINGS = (
@@ -111,7 +96,8 @@ def run(cfg: DictConfig) -> float | None:
     """Builds, fits and tests; writes `metrics.json`, prints the numbers that matter and where they lie.
 
     Returns the value of `optimized_metric`, or None where none is named. A failed run leaves its traceback in
-    the log file and a `metrics.json` with `status: failed`, and raises.
+    the log file and a `metrics.json` with `status: failed`, and raises. One that is interrupted (Ctrl-C, SIGTERM)
+    keeps its last step, and ends the program with code 130 or 143.
     """
     clock = _Clock()
     folder = Path(cfg.run_dir)
@@ -124,11 +110,20 @@ def run(cfg: DictConfig) -> float | None:
         with _own_processes(experiment):
             record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
     except BaseException as error:
-        log.info("the run failed", exc_info=True)  # the console gets the message alone
-        record.update(status="failed", error=f"{type(error).__name__}: {error}"[:2000], seconds=clock.laps())
+        code = _interruption(error)
+        log.info("the run ended early", exc_info=code is None)  # the console gets the message alone
+        record.update(
+            status="failed" if code is None else "interrupted",
+            error=f"{type(error).__name__}: {error}"[:2000],
+            seconds=clock.laps(),
+        )
         if _is_first_process():
             report.write_json(folder / "metrics.json", record)
-        raise
+        if code is None:
+            raise
+        place = report.short_path(folder)
+        sys.stderr.write(f"interrupted; what it reached is in {place}, go on with ckpt_path={place}\n")
+        raise SystemExit(code) from None
     record.update(status="ok", steps=experiment.trainer.global_step, seconds=clock.laps())
     record.update(_measurements(experiment))
     if experiment.trainer.is_global_zero:
@@ -195,73 +190,12 @@ def newest_checkpoint(folder: Path, besides: Path | None = None) -> Path:
     return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name == "last.ckpt"))
 
 
-def check_targets(tree: Any, key: str = "") -> None:
-    """Refuses every `_target_` outside the allowed packages and every argument that a target does not take.
-
-    The environment variable RENDRA_LAB_PACKAGES names further packages, separated by commas: a plug-in is
-    trusted by whoever runs it, never by a configuration file.
-    """
-    if isinstance(tree, Mapping):
-        if "_target_" in tree:
-            _check_arguments(_locate(str(tree["_target_"]), key), tree, key)
-        for name, value in tree.items():
-            check_targets(value, f"{key}.{name}" if key else str(name))
-    elif isinstance(tree, list):
-        for index, value in enumerate(tree):
-            check_targets(value, f"{key}[{index}]")
-
-
-def _locate(path: str, key: str) -> Any:
-    extra = tuple(name.strip() for name in os.environ.get("RENDRA_LAB_PACKAGES", "").split(",") if name.strip())
-    if not _below(path, _ALLOWED_TARGETS + extra):
-        raise UserError(
-            f"{key}: a configuration may not call {path!r}; allowed are {', '.join(_ALLOWED_TARGETS)}"
-            " and the packages named in RENDRA_LAB_PACKAGES"
-        )
-    target = _resolve(path, key)
-    home = getattr(target, "__module__", None) or type(target).__module__
-    if not _below(home, _ALLOWED_HOMES + extra) or not callable(target):
-        raise UserError(f"{key}: a configuration may not call {path!r}, which is {home}'s")
-    return target
-
-
-def _resolve(path: str, key: str) -> Any:
-    """The object under a dotted path: the longest importable module, then attributes."""
-    names = path.split(".")
-    for length in range(len(names) - 1, 0, -1):
-        module_name = ".".join(names[:length])
-        try:
-            target: Any = importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not _below(module_name, (error.name,)):
-                raise  # the module exists; something that it imports does not
-            continue
-        for done, name in enumerate(names[length:], length):
-            if not hasattr(target, name):
-                near = difflib.get_close_matches(name, dir(target), 1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise UserError(f"{key}: {'.'.join(names[:done])} has no {name!r}{hint}")
-            target = getattr(target, name)
-        return target
-    raise UserError(f"{key}: there is no module {names[0]!r}, named by {path!r}")
-
-
-def _below(path: str, packages: tuple[str, ...]) -> bool:
-    return any(path == package or path.startswith(f"{package}.") for package in packages)
-
-
-def _check_arguments(target: Any, node: Mapping[str, Any], key: str) -> None:
-    try:
-        parameters = inspect.signature(target).parameters
-    except (TypeError, ValueError):
-        return
-    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    for name in node:
-        if name not in parameters and not (name.startswith("_") and name.endswith("_")):
-            near = difflib.get_close_matches(name, parameters, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"it takes: {', '.join(parameters)}"
-            raise UserError(f"{key}.{name}: {target.__qualname__} takes no {name!r}; {hint}")
+def _interruption(error: BaseException) -> int | None:
+    """The exit code of a program that a signal ended, as shells count it; None for any other error."""
+    if isinstance(error, SIGTERMException):
+        return 128 + signal.SIGTERM
+    stopped = isinstance(error, KeyboardInterrupt) or isinstance(error.__context__, KeyboardInterrupt)
+    return 128 + signal.SIGINT if stopped else None
 
 
 class _Clock:

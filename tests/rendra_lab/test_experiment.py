@@ -2,6 +2,8 @@
 
 import csv
 import json
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,12 @@ from typing import Any
 import pytest
 import torch
 from omegaconf import OmegaConf
+from rendra_lab_toy import ToyTask
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rendra_lab.errors import UserError
-from rendra_lab.experiment import build, check_targets, evaluate, find_checkpoint, load_run, run
+from rendra_lab.experiment import build, evaluate, find_checkpoint, load_run, run
+from rendra_lab.targets import check_targets
 
 Compose = Callable[..., Any]
 
@@ -110,13 +114,37 @@ def test_a_broken_run_goes_on_to_the_same_end(compose: Compose, tmp_path: Path) 
         assert torch.equal(weight, ends[1]["state_dict"][name])
 
 
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_an_interrupted_run_keeps_its_step(
+    name: str, code: int, compose: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    inner = ToyTask.training_step
+
+    def interrupted(self: ToyTask, batch: Any, batch_idx: int) -> Any:
+        if self.global_step == 7:
+            os.kill(os.getpid(), signal.Signals[name])
+        return inner(self, batch, batch_idx)
+
+    monkeypatch.setattr(ToyTask, "training_step", interrupted)
+    folder = tmp_path / "toy" / "run"
+    try:
+        with pytest.raises(SystemExit) as end:
+            run(compose(folder, "task=toy", "trainer.max_steps=30"))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert end.value.code == code
+    assert record_of(folder)["status"] == "interrupted"
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert state["global_step"] in (7, 8)
+
+
 def test_the_checkpoint_to_resume_from(tmp_path: Path) -> None:
     old, new = (tmp_path / "toy" / name / "checkpoints" for name in ("1", "2_sweep/0_lr=1"))
     for age, folder in enumerate((old, new)):
         folder.mkdir(parents=True)
         (folder / "last.ckpt").touch()
-        import os
-
         os.utime(folder / "last.ckpt", (age, age))
     here = tmp_path / "toy" / "3"
     assert find_checkpoint(None, here, tmp_path) is None
