@@ -46,6 +46,9 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         main()
         if FailureKeeper.failure is not None:
             raise FailureKeeper.failure
+    except BrokenPipeError:  # the reader of the output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_EXIT_FAILURE)
     except Exception as error:
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
