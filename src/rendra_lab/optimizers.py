@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-
 _DOUBLINGS = 8  # of a step that pays: 256 times its length
 
 
@@ -45,7 +44,13 @@ class LevenbergMarquardt(torch.optim.Optimizer):
         widest, finest = difference
         if not widest >= finest > 0:
             raise ValueError(f"difference goes from a wide to a fine positive step, got {list(difference)}")
-        defaults = {"lr": lr, "difference": float(widest), "finest": float(finest), "damping": damping, "tries": tries}
+        defaults = {
+            "lr": lr,
+            "difference": float(widest),
+            "finest": float(finest),
+            "damping": damping,
+            "tries": tries,
+        }
         super().__init__(params, defaults)
         if len(self.param_groups) != 1:
             raise ValueError(f"LevenbergMarquardt takes one parameter group, got {len(self.param_groups)}")

@@ -134,7 +134,9 @@ def _print_table(folder: Path, rows: list[Row]) -> None:
     best = rows[0]["optimized_metric"] if rows else None
     table = Table(title=f"{len(rows)} runs" + (f", best {best} first" if best else ""))
     for column in columns:
-        table.add_column(column, justify="left" if column == "status" else "right", overflow="fold")
+        table.add_column(
+            column.removeprefix("test/"), justify="left" if column == "status" else "right", overflow="fold"
+        )
     for row, line in zip(rows, lines, strict=True):
         table.add_row(*line, style="red" if row["status"] != "ok" else None)
     place = short_path(folder)

@@ -144,7 +144,11 @@ class PhotoView(SingleView):
         rgba = _fit_into(torch.cat([rgb, self.mask[..., None]], dim=-1), self.scene.image_size)
         rgb = rgba[..., :3] + background * (1 - rgba[..., 4:])  # outside the photograph
         self.target = ViewBatch(
-            rgb[None], rgba[None, ..., 3], torch.full((1, 3, 3), torch.nan), torch.full((1, 3), torch.nan), torch.zeros(1)
+            rgb[None],
+            rgba[None, ..., 3],
+            torch.full((1, 3, 3), torch.nan),
+            torch.full((1, 3), torch.nan),
+            torch.zeros(1),
         )
 
 

@@ -97,7 +97,11 @@ class MeshView(nn.Module):
             "image_size_hw_px": list(self.image_size),
             "fov_deg": self.fov_deg,
             "rendra": {"R": R.tolist(), "T": T.tolist()},
-            "opencv": {"R": opencv.R[0].tolist(), "tvec": opencv.tvec[0].tolist(), "K": opencv.camera_matrix[0].tolist()},
+            "opencv": {
+                "R": opencv.R[0].tolist(),
+                "tvec": opencv.tvec[0].tolist(),
+                "K": opencv.camera_matrix[0].tolist(),
+            },
             "opengl": {"camera_to_world": opengl.camera_to_world[0].tolist()},
         }
 

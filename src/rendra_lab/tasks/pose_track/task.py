@@ -34,7 +34,9 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
     track_T: Tensor
     frame: Tensor
 
-    def __init__(self, scene: MeshView, pose: CameraPose, start: GivenStart | MultiStart, frames: int, **parts: Any) -> None:
+    def __init__(
+        self, scene: MeshView, pose: CameraPose, start: GivenStart | MultiStart, frames: int, **parts: Any
+    ) -> None:
         super().__init__(**parts)
         self.scene = scene
         self.pose = pose
