@@ -101,7 +101,8 @@ def _accumulate(rgba: Tensor, shift: Tensor, depth: Tensor, sigma: float) -> Ten
     for offset in _OFFSETS:
         splat_depth = _neighbor(far, offset)
         same = (splat_depth - depth[..., :1]).abs().argmin(-1, keepdim=True)
-        groups = torch.stack((index < same, index == same, index > same), dim=-2)  # (N, H, W, 3, K)
+        hidden = (index > same) & (_neighbor(shares, offset)[..., 3] > 0)  # empty slots hide nothing, however many
+        groups = torch.stack((index < same, index == same, hidden), dim=-2)  # (N, H, W, 3, K)
         weight = _weight(_neighbor(shift, offset), offset, sigma)
         layers = layers + (groups * weight[..., None, :]) @ _neighbor(shares, offset)
     return layers
