@@ -18,7 +18,7 @@ class LevenbergMarquardt(torch.optim.Optimizer):
     keeps the step if the objective falls; else lambda grows and it tries again. (Levenberg 1944, Marquardt 1963;
     Madsen, Nielsen & Tingleff, "Methods for non-linear least squares problems", 2004, Sec. 3.2.)
 
-    The task hands over `residuals` before every step (`Task`): the vector (R,) as a function of the parameters' state.
+    The task hands over `residuals` before every step (`Task`): the vector (R,) at the parameters' present values.
 
     Args:
         params: the parameters; one group.

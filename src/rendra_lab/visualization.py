@@ -103,12 +103,26 @@ def captioned_row(pictures: Mapping[str, Picture], height_px: int | None = None)
 
 
 def story(chapters: Sequence[tuple[str, Mapping[str, Picture]]], height_px: int = 192) -> Picture:
-    """Rows of captioned pictures, one a chapter, with the chapter's title in each caption."""
-    rows = [
-        _hstack([caption(resize(picture, height_px), f"{title}: {name}") for name, picture in pictures.items()])
-        for title, pictures in chapters
-    ]
-    return tile(rows, columns=1)
+    """How pictures came about: first those that never change, then one row for each other, chapter by chapter.
+
+    Args:
+        chapters: title and pictures by name, the same names in each.
+        height_px: of a picture.
+
+    Raises:
+        ValueError: no chapters.
+    """
+    if not chapters:
+        raise ValueError("a story needs at least one chapter")
+    first = chapters[0][1]
+    constant = [name for name in first if all(np.array_equal(first[name], other[name]) for _, other in chapters)]
+    rows = [[caption(resize(first[name], height_px), name) for name in constant]]
+    for name in first:
+        if name not in constant:
+            rows.append(
+                [caption(resize(pictures[name], height_px), f"{title}: {name}") for title, pictures in chapters]
+            )
+    return tile([_hstack(row) for row in rows if row], columns=1)
 
 
 def resize(picture: Picture, height_px: int) -> Picture:

@@ -63,8 +63,8 @@ class RenderedSequence(LightningDataModule):
             raise ValueError(f"a sequence needs frames and steps, got {frames} and {steps_per_frame}")
         self.scene = scene
         self.steps_per_frame = steps_per_frame
-        path = (_even(frames, *ends) for ends in (distance, elevation_deg, azimuth_deg))
-        self.R, self.T = look_at_view_transform(*path)
+        distances, elevations, azimuths = (_even(frames, *ends) for ends in (distance, elevation_deg, azimuth_deg))
+        self.R, self.T = look_at_view_transform(distances, elevations, azimuths)
 
     def setup(self, stage: str) -> None:
         """Lightning's hook: renders the views."""

@@ -57,7 +57,7 @@ def shrink(rgb: Tensor, silhouette: Tensor, size: tuple[int, int]) -> tuple[Tens
 
 @torch.no_grad()
 def render_views(scene: MeshView, R: Tensor, T: Tensor) -> ViewBatch:
-    """What the scene shows to cameras R (B, 3, 3), T (B, 3); the silhouette is the exact coverage of pixel centres."""
+    """What the scene shows to cameras R (B, 3, 3), T (B, 3); the silhouette is the exact coverage."""
     # a soft edge is fatter than the mesh, since every face near it adds its own: here the edge is hard
     views = [scene(R[i : i + 1], T[i : i + 1], sigma=_HARD_EDGE) for i in range(len(R))]
     silhouettes = torch.cat([(silhouette > 0.5).float() for silhouette, _ in views])

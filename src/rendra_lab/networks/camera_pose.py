@@ -38,6 +38,7 @@ class CameraPose(nn.Module, ABC):
     degrees_of_freedom: int
     R: Tensor
     T: Tensor
+    is_placed: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -74,7 +75,7 @@ class LookAtPose(CameraPose):
 
 
 class SixDofPose(CameraPose):
-    """A free camera: the step is a rotation vector in the view frame (rad) and a translation (6 degrees of freedom)."""
+    """A free camera: the step is a rotation vector in the view frame (rad) and a translation."""
 
     degrees_of_freedom = 6
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -43,18 +44,18 @@ class MeshView(nn.Module):
     def __init__(
         self,
         mesh: Meshes,
-        image_size: int | tuple[int, int] = 256,
+        image_size: int | Sequence[int] = 256,
         fov_deg: float = 60.0,
         sigma: float = 1e-4,
         layers: int = 1,
         lights: Any = None,
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        background: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
         super().__init__()
         if len(mesh) != 1:
             raise ValueError(f"a MeshView shows one mesh, got a batch of {len(mesh)}")
         self.mesh = mesh
-        self.image_size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        self.image_size = _height_width(image_size)
         self.fov_deg = fov_deg
         self.sigma = sigma
         self.layers = layers
@@ -90,7 +91,7 @@ class MeshView(nn.Module):
         return FoVPerspectiveCameras(R=R, T=T, fov=self.fov_deg, aspect_ratio=1.0, device=R.device)
 
     def describe_camera(self, R: Tensor, T: Tensor) -> dict[str, Any]:
-        """One camera R (3, 3), T (3,) in the conventions of this library, of OpenCV and of OpenGL/Blender, as lists."""
+        """One camera R (3, 3), T (3,), as lists: in this library's conventions, OpenCV's and OpenGL's (Blender's)."""
         cameras, size = self.cameras(R[None], T[None]), torch.tensor([self.image_size])
         opencv, opengl = opencv_from_cameras(cameras, size), opengl_from_cameras(cameras, size)
         return {
@@ -108,3 +109,10 @@ class MeshView(nn.Module):
     def _follow(self, device: torch.device) -> None:
         if self.mesh.device != device:
             self.mesh, self.lights = self.mesh.to(device), self.lights.to(device)
+
+
+def _height_width(image_size: int | Sequence[int]) -> tuple[int, int]:
+    if isinstance(image_size, int):
+        return image_size, image_size
+    height, width = image_size
+    return int(height), int(width)

@@ -27,7 +27,7 @@ def metrics_of(folder):
     [
         ("solver=adam", "optimizer.lr=0.1", "trainer.max_steps=120"),
         ("solver=levenberg_marquardt", "compare_px=32"),
-        ("solver=levenberg_marquardt", "compare_px=32", "pose=six_dof", "init.position=[1.0,3.0,2.4]"),
+        ("solver=levenberg_marquardt", "compare_px=32", "pose=six_dof", "init.position=[0.3,2.6,2.1]"),
     ],
 )
 def test_a_start_reaches_the_camera(compose, tmp_path, overrides):
