@@ -531,6 +531,36 @@ def test_relative_cameras_agree_with_absolute_ones() -> None:
     assert_close(same, torch.ones(3))
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_picture_taken_without_gradients_leaves_the_mesh_trainable(mode: type) -> None:
+    """Validation looks at the very objects that training goes on with."""
+    renderer = phong_renderer_of(32)
+    base = join_meshes_as_batch([ico_sphere(2), ico_sphere(1)])
+
+    def gradients(look_first: bool) -> list[torch.Tensor]:
+        torch.manual_seed(0)
+        offsets = torch.zeros_like(base.verts_packed()).requires_grad_()
+        colors = [torch.rand(162, 3, requires_grad=True), torch.rand(42, 3, requires_grad=True)]
+        mesh = base.offset_verts(offsets)
+        mesh.textures = TexturesVertex(colors)
+        if look_first:
+            with mode():
+                renderer.rasterizer(base)
+                for each in (base, mesh):
+                    each.verts_normals_padded(), each.faces_areas_packed(), each.laplacian_packed()
+                    each.faces_packed_to_edges_packed(), each.extend(2)
+                renderer(mesh)
+        image = renderer(mesh).square().sum() + mesh.extend(2).verts_padded().square().sum()
+        smooth = mesh.laplacian_packed().mm(mesh.verts_packed()).norm(dim=1).mean() + mesh.faces_areas_packed().std()
+        edges = mesh.verts_packed()[mesh.edges_packed()].square().sum()
+        return list(torch.autograd.grad(image + smooth + edges, [offsets, *colors]))
+
+    looked = gradients(look_first=True)
+    base = join_meshes_as_batch([ico_sphere(2), ico_sphere(1)])
+    for before, without in zip(looked, gradients(look_first=False), strict=True):
+        assert_close(before, without)
+
+
 # -- bookkeeping of batches
 
 
@@ -547,7 +577,9 @@ def test_batches_are_sorted_out_again() -> None:
     assert (image[..., 0] > 0.9).any()
     assert (image[..., 1] > 0.9).any()
     assert [len(part) for part in batch.split([1, 1])] == [1, 1]
-    assert torch.equal(batch[1].verts_packed(), small.verts_packed())
+    for index in (1, -1, [1], slice(1, 2), np.int64(1), torch.tensor([1]), torch.tensor([False, True])):
+        assert torch.equal(batch[index].verts_packed(), small.verts_packed())
+        assert len(FoVPerspectiveCameras(fov=(20.0, 30.0))[index]) == 1
 
 
 @pytest.mark.parametrize(

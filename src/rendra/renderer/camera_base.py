@@ -5,6 +5,7 @@ The frames are those of `rendra.renderer.cameras`, which holds the cameras thems
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any, ClassVar, TypeAlias
 
 import torch
@@ -157,9 +158,9 @@ class CamerasBase(TensorProperties):
             return index
         if isinstance(index, Tensor) and not index.is_floating_point() and index.dim() <= 1:
             index, values = index.reshape(-1), index.reshape(-1).tolist()
-        elif isinstance(index, int):
-            index = values = [index]
-        elif isinstance(index, list) and all(isinstance(i, int) for i in index):
+        elif isinstance(index, Integral):
+            index = values = [int(index)]
+        elif isinstance(index, list) and all(isinstance(i, Integral) for i in index):
             values = index
         else:
             expected = "int, list of int, slice, or tensor of bool or integers"

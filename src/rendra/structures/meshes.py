@@ -8,7 +8,7 @@ Frame: the caller's. A face whose vertices run counter-clockwise looks at the vi
 (v1 - v0) x (v2 - v0) points there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra.structures.mesh_input import normals_for, rows_from_lists, rows_from_padded
-from rendra.structures.ragged import Ragged, batch_indices
+from rendra.structures.ragged import Ragged, batch_indices, lasting
 from rendra.structures.topology import Topology
 
 _NORMAL_EPS = 1e-6  # shorter vectors are divided by this instead of by their length
@@ -92,8 +92,13 @@ class Meshes:
         new._textures = textures
         return new
 
-    def _keep(self, name: str, value: Any) -> Any:
-        if not self._verts.trainable:
+    def _derive(self, name: str, derive: Callable[[], Any]) -> Any:
+        """What follows from the vertices, from memory where it may be."""
+        if name in self._derived:
+            return self._derived[name]
+        with lasting():
+            value = derive()
+        if self._verts.is_lasting:
             self._derived[name] = value
         return value
 
@@ -252,23 +257,24 @@ class Meshes:
 
     def _faces_cross(self) -> Tensor:
         """(v1 - v0) x (v2 - v0): along the normal, twice the area long. (sum F, 3)"""
-        if "cross" in self._derived:
-            return self._derived["cross"]
-        corners = self.verts_packed().index_select(0, self.faces_packed().reshape(-1))
-        v0, v1, v2 = corners.view(-1, 3, 3).unbind(1)
-        return self._keep("cross", torch.linalg.cross(v1 - v0, v2 - v0))
+
+        def cross() -> Tensor:
+            corners = self.verts_packed().index_select(0, self.faces_packed().reshape(-1))
+            v0, v1, v2 = corners.view(-1, 3, 3).unbind(1)
+            return torch.linalg.cross(v1 - v0, v2 - v0)
+
+        return self._derive("cross", cross)
 
     def faces_areas_packed(self) -> Tensor:
         """Area of each face, in squared units of the vertices. (sum F,)"""
-        if "areas" in self._derived:
-            return self._derived["areas"]
-        return self._keep("areas", 0.5 * torch.linalg.vector_norm(self._faces_cross(), dim=1))
+        return self._derive("areas", lambda: 0.5 * torch.linalg.vector_norm(self._faces_cross(), dim=1))
 
     def _faces_normals(self) -> Ragged:
-        if "faces_normals" in self._derived:
-            return self._derived["faces_normals"]
-        normals = F.normalize(self._faces_cross(), eps=_NORMAL_EPS, dim=1)
-        return self._keep("faces_normals", Ragged(self._topology.faces.lengths, packed=normals))
+        def normals() -> Ragged:
+            unit = F.normalize(self._faces_cross(), eps=_NORMAL_EPS, dim=1)
+            return Ragged(self._topology.faces.lengths, packed=unit)
+
+        return self._derive("faces_normals", normals)
 
     def faces_normals_packed(self) -> Tensor:
         """Unit normal of each face, 0 for a face without area. (sum F, 3)"""
@@ -289,14 +295,15 @@ class Meshes:
     def _verts_normals(self) -> Ragged:
         if self._normals is not None:
             return self._normals
-        if "verts_normals" in self._derived:
-            return self._derived["verts_normals"]
-        cross, verts = self._faces_cross(), self.verts_packed()
-        summed = torch.zeros_like(verts)
-        for corner in self.faces_packed().unbind(1):
-            summed = summed.index_add(0, corner, cross)
-        normals = F.normalize(summed, eps=_NORMAL_EPS, dim=1)
-        return self._keep("verts_normals", Ragged(self._topology.verts, packed=normals))
+
+        def normals() -> Ragged:
+            cross, verts = self._faces_cross(), self.verts_packed()
+            summed = torch.zeros_like(verts)
+            for corner in self.faces_packed().unbind(1):
+                summed = summed.index_add(0, corner, cross)
+            return Ragged(self._topology.verts, packed=F.normalize(summed, eps=_NORMAL_EPS, dim=1))
+
+        return self._derive("verts_normals", normals)
 
     def verts_normals_packed(self) -> Tensor:
         """Unit normal of each vertex: as given, or its faces' mean weighted by area. (sum V, 3)"""

@@ -1,12 +1,27 @@
 """A batch of rows of which every item has its own number: the storage behind meshes and textures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from itertools import accumulate
+from numbers import Integral
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+@contextmanager
+def lasting() -> Iterator[None]:
+    """What is computed inside may be kept: it consists of normal tensors, in inference mode too.
+
+    Autograd refuses inference tensors, so a picture taken in inference mode would spoil its mesh for training.
+    """
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(False), torch.no_grad():
+        yield
 
 
 class Lengths:
@@ -23,23 +38,27 @@ class Lengths:
         return len(self.sizes)
 
     @cached_property
+    @lasting()
     def counts(self) -> Tensor:
         """Rows of each item. (N,)"""
         return torch.tensor(self.sizes, dtype=torch.int64, device=self.device)
 
     @cached_property
+    @lasting()
     def first_idx(self) -> Tensor:
         """Packed index of each item's first row. (N,)"""
         starts = list(accumulate(self.sizes, initial=0))[:-1]
         return torch.tensor(starts, dtype=torch.int64, device=self.device)
 
     @cached_property
+    @lasting()
     def item_idx(self) -> Tensor:
         """The item that each packed row belongs to. (total,)"""
         items = torch.arange(len(self.sizes), device=self.device)
         return items.repeat_interleave(self.counts, output_size=self.total)
 
     @cached_property
+    @lasting()
     def padded_idx(self) -> Tensor:
         """Where each packed row lies among the N * padded_size rows of the padded form. (total,)"""
         rows = torch.arange(self.total, device=self.device)
@@ -62,7 +81,7 @@ class Ragged:
     One quantity of every row as list, padded or packed; held in one form, turned into the others on demand.
 
     A form derived from a leaf that requires grad is not kept: the optimiser changes such a leaf in place, and
-    every backward pass needs its own graph.
+    every backward pass needs its own graph. Nor is what was derived without the graph that it would have had.
     """
 
     def __init__(
@@ -81,7 +100,9 @@ class Ragged:
         self._padded = padded
         self._items = items
         held = items if items is not None else [packed if padded is None else padded]
-        self.trainable = any(t is not None and t.requires_grad and t.is_leaf for t in held)
+        grad = [t for t in held if t is not None and t.requires_grad]
+        self._requires_grad = bool(grad)
+        self._trainable = any(t.is_leaf for t in grad)
 
     @classmethod
     def from_list(cls, items: Sequence[Tensor], like: Tensor, pad_value: float = 0) -> "Ragged":
@@ -94,11 +115,16 @@ class Ragged:
     def __len__(self) -> int:
         return len(self.lengths)
 
+    @property
+    def is_lasting(self) -> bool:
+        """Whether what is derived from the rows now may be kept."""
+        return not self._requires_grad or (torch.is_grad_enabled() and not self._trainable)
+
     def packed(self) -> Tensor:
         """All rows in one tensor. (total, ...)"""
         if self._packed is not None:
             return self._packed
-        return self._keep("_packed", self._pack())
+        return self._keep("_packed", self._pack)
 
     def _pack(self) -> Tensor:
         if self._items is not None:
@@ -111,12 +137,15 @@ class Ragged:
         """Every item filled up at its end. (N, padded_size, ...)"""
         if self._padded is not None:
             return self._padded
+        return self._keep("_padded", self._pad)
+
+    def _pad(self) -> Tensor:
         rows, lengths = self.packed(), self.lengths
         shape = (len(lengths), lengths.padded_size, *rows.shape[1:])
         if lengths.dense:
-            return self._keep("_padded", rows.reshape(shape))
+            return rows.reshape(shape)
         filled = rows.new_full((shape[0] * shape[1], *rows.shape[1:]), self.pad_value)
-        return self._keep("_padded", filled.index_copy(0, lengths.padded_idx, rows).view(shape))
+        return filled.index_copy(0, lengths.padded_idx, rows).view(shape)
 
     def items(self) -> list[Tensor]:
         """One tensor an item. N of (M_i, ...)"""
@@ -124,10 +153,12 @@ class Ragged:
             return list(self._items)
         if len(self) == 0:
             return []
-        return list(self._keep("_items", list(self.packed().split(self.lengths.sizes))))
+        return list(self._keep("_items", lambda: list(self.packed().split(self.lengths.sizes))))
 
-    def _keep(self, form: str, value: Any) -> Any:
-        if not self.trainable:
+    def _keep(self, form: str, derive: Callable[[], Any]) -> Any:
+        with lasting():
+            value = derive()
+        if self.is_lasting:
             setattr(self, form, value)
         return value
 
@@ -175,10 +206,10 @@ def batch_indices(index: Any, size: int) -> list[int]:
         if index.dtype == torch.bool and index.numel() != size:
             raise IndexError(f"a boolean index needs one entry for each of the {size} items, got {index.numel()}")
         index = index.nonzero()[:, 0].tolist() if index.dtype == torch.bool else index.tolist()
-    picked = [index] if isinstance(index, int) else index
-    if not isinstance(picked, list) or not all(isinstance(i, int) for i in picked):
+    picked = [index] if isinstance(index, Integral) else index
+    if not isinstance(picked, list) or not all(isinstance(i, Integral) for i in picked):
         raise IndexError(f"index must be an int, a slice, a list of ints or a 1-D tensor, got {index!r}")
     for i in picked:
         if not -size <= i < size:
             raise IndexError(f"index {i} is out of range for a batch of {size}")
-    return [i % size for i in picked]
+    return [int(i) % size for i in picked]

@@ -11,7 +11,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from rendra.structures.ragged import Lengths, Ragged
+from rendra.structures.ragged import Lengths, Ragged, lasting
 
 
 def uniform_laplacian(num_verts: int, edges: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -50,6 +50,7 @@ class Topology:
         return len(self.verts)
 
     @cached_property
+    @lasting()
     def faces_packed(self) -> Tensor:
         """Faces that count all vertices of the batch. (sum F, 3)"""
         faces = self.faces.packed()
@@ -58,11 +59,13 @@ class Topology:
         return faces + self.verts.first_idx[self.faces.lengths.item_idx, None]
 
     @cached_property
+    @lasting()
     def valid(self) -> Tensor:
         """Which meshes have at least one face. (N,) bool"""
         return self.faces.lengths.counts > 0
 
     @cached_property
+    @lasting()
     def _edges_of_faces(self) -> tuple[Tensor, Tensor]:
         # edge k of a face lies opposite to its vertex k
         sides = self.faces_packed[:, [[1, 2], [2, 0], [0, 1]]]  # (F, 3, 2)
@@ -83,15 +86,18 @@ class Topology:
         return self._edges_of_faces[1]
 
     @cached_property
+    @lasting()
     def edges_to_mesh(self) -> Tensor:
         """The mesh of each edge. (E,)"""
         return self.verts.item_idx[self.edges[:, 0]]
 
     @cached_property
+    @lasting()
     def edge_counts(self) -> Tensor:
         """The number of edges of each mesh. (N,)"""
         return torch.bincount(self.edges_to_mesh, minlength=len(self))
 
+    @lasting()
     def laplacian(self, dtype: torch.dtype) -> Tensor:
         """The uniform Laplacian of all vertices. (sum V, sum V) sparse"""
         if self._laplacian is None or self._laplacian.dtype != dtype:
@@ -102,6 +108,7 @@ class Topology:
         """Some of the meshes, repetition allowed."""
         return Topology(self.faces.select(indices), self.verts.select(indices))
 
+    @lasting()
     def extended(self, repeats: int) -> "Topology":
         """Every mesh `repeats` times in a row; remembered, since a fit asks for the same at each step."""
         if self._extended is None or self._extended[0] != repeats:
