@@ -117,11 +117,11 @@ def story(chapters: Sequence[tuple[str, Mapping[str, Picture]]], height_px: int 
     first = chapters[0][1]
     constant = [name for name in first if all(np.array_equal(first[name], other[name]) for _, other in chapters)]
     rows = [[caption(resize(first[name], height_px), name) for name in constant]]
-    for name in first:
-        if name not in constant:
-            rows.append(
-                [caption(resize(pictures[name], height_px), f"{title}: {name}") for title, pictures in chapters]
-            )
+    rows += [
+        [caption(resize(pictures[name], height_px), f"{title}: {name}") for title, pictures in chapters]
+        for name in first
+        if name not in constant
+    ]
     return tile([_hstack(row) for row in rows if row], columns=1)
 
 
