@@ -61,14 +61,10 @@ def sine_defect_ratio(angle_squared: Tensor) -> Tensor:
 def cotangent_defect_ratio(angle_squared: Tensor) -> Tensor:
     """(1 - (theta/2) cot(theta/2)) / theta², from theta²; 1/12 at zero. Finite for theta < 2 pi."""
     series = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000, 1 / 74724249600)
-    return _smooth(
-        angle_squared, lambda t: (1 - 0.5 * t / torch.tan(0.5 * t)) / t.square(), series, bound=0.25
-    )
+    return _smooth(angle_squared, lambda t: (1 - 0.5 * t / torch.tan(0.5 * t)) / t.square(), series, bound=0.25)
 
 
-def _smooth(
-    x: Tensor, closed_form: Callable[[Tensor], Tensor], series: tuple[float, ...], bound: float
-) -> Tensor:
+def _smooth(x: Tensor, closed_form: Callable[[Tensor], Tensor], series: tuple[float, ...], bound: float) -> Tensor:
     """`closed_form(sqrt(x))` where x >= bound, the polynomial `series` in x below; x >= 0."""
     near = x < bound
     far = closed_form(torch.where(near, 1.0, x).sqrt())

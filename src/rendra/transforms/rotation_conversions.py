@@ -179,12 +179,8 @@ def matrix_to_euler_angles(matrix: Tensor, convention: str) -> Tensor:
     squared = a.square() + b.square()
     locked = squared < (16.0 * torch.finfo(matrix.dtype).eps) ** 2
     length = torch.where(locked, 0.0, torch.where(locked, 1.0, squared).sqrt())
-    middle = (
-        torch.atan2(length, matrix[..., i, i]) if last == i else torch.atan2(sign * matrix[..., i, k], length)
-    )
-    first = torch.atan2(
-        torch.where(locked, sign * matrix[..., k, j], c), torch.where(locked, matrix[..., j, j], d)
-    )
+    middle = torch.atan2(length, matrix[..., i, i]) if last == i else torch.atan2(sign * matrix[..., i, k], length)
+    first = torch.atan2(torch.where(locked, sign * matrix[..., k, j], c), torch.where(locked, matrix[..., j, j], d))
     third = torch.atan2(torch.where(locked, 0.0, a), torch.where(locked, 1.0, b))
     return torch.stack((first, middle, third), dim=-1)
 

@@ -18,9 +18,7 @@ def so3_relative_angle(
     return so3_rotation_angle(R1 @ R2.transpose(-1, -2), cos_angle=cos_angle, cos_bound=cos_bound, eps=eps)
 
 
-def so3_rotation_angle(
-    R: Tensor, eps: float = 1e-4, cos_angle: bool = False, cos_bound: float = 1e-4
-) -> Tensor:
+def so3_rotation_angle(R: Tensor, eps: float = 1e-4, cos_angle: bool = False, cos_bound: float = 1e-4) -> Tensor:
     """Angles (N,) in radians of rotation matrices (N, 3, 3): acos((trace - 1) / 2).
 
     Args:
@@ -39,8 +37,7 @@ def so3_rotation_angle(
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
     if ((trace < -1.0 - eps) | (trace > 3.0 + eps)).any():
         raise ValueError(
-            "A matrix has trace outside valid range [-1-eps, 3+eps]: "
-            f"got {trace.min():.6g} to {trace.max():.6g}"
+            f"A matrix has trace outside valid range [-1-eps, 3+eps]: got {trace.min():.6g} to {trace.max():.6g}"
         )
     cosine = 0.5 * (trace - 1.0)
     if cos_angle:
