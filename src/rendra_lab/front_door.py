@@ -91,7 +91,8 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
         return _explain_key(unknown[1], config_dir, config_name)
     missing = re.search(r"Missing mandatory value: (\S+)", str(error))
     if missing:
-        return f"{missing[1]} needs a value: {missing[1]}=..."
+        key = getattr(error, "full_key", None) or missing[1]
+        return f"{key} needs a value: {key}=..."
     return _plain(error)
 
 
