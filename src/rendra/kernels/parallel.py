@@ -68,12 +68,16 @@ def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             result = compiled(*arguments)
             if len(compiled.signatures) > known and compiled.stats.cache_misses:
                 seconds = time.perf_counter() - started
-                _log.info("compiled %s once in %.1f s; it is cached now", function.__name__, seconds)
+                _log.info("compiled kernel %s in %.1f s, once: it is cached now", _short_name(function), seconds)
         return result
 
     run.__name__ = function.__name__
     run.__doc__ = function.__doc__
     return run
+
+
+def _short_name(function: Callable[..., Any]) -> str:
+    return f"{function.__module__.removeprefix('rendra.kernels.').removesuffix('.numba_cpu')}.{function.__name__}"
 
 
 scalar_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
