@@ -110,7 +110,7 @@ def _cells(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     lines = [
         [
             str(row["job"]),
-            *(row["settings"].get(key, "-") for key in varied),
+            *(_shortened(row["settings"].get(key, "-")) for key in varied),
             *(format_number(row["metrics"].get(name)) for name in names),
             "-" if row["seconds"] is None else f"{row['seconds']:.1f}",
             row["status"],
@@ -118,6 +118,14 @@ def _cells(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
         for row in rows
     ]
     return columns, lines
+
+
+def _shortened(setting: str) -> str:
+    """A drawn number with the digits that matter; words and typed numbers as they are."""
+    try:
+        return setting if len(setting) <= 8 else format_number(float(setting))
+    except ValueError:
+        return setting
 
 
 def _one_line(message: str) -> str:
