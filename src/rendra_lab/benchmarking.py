@@ -235,7 +235,7 @@ def machine(device: str) -> dict[str, Any]:
         "gpu": graphics,
         "device": device,
         "threads": num_threads(),
-        "omp_wait_policy": os.environ.get("OMP_WAIT_POLICY"),
+        **{name: os.environ[name] for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT") if name in os.environ},
         "load_average": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
         **{name: packages[name] for name in ("python", "torch", "numba", "numpy", "rendra")},
     }

@@ -3,7 +3,7 @@
 - Kernels are compiled on first use and cached on disk; the first compilation is reported by one log line.
 - The number of threads follows `torch.get_num_threads()`.
 - Torch brings an OpenMP runtime of its own beside Numba's. Where several such processes share a machine, start them
-  with OMP_WAIT_POLICY=passive: threads that spin while they wait keep the cores from those that have work.
+  with GOMP_SPINCOUNT=2000: threads that spin for long while they wait keep the cores from those that have work.
 - One kernel runs at a time in a process: Numba's `workqueue` layer aborts when two Python threads enter it.
 - A child made by `fork` after a kernel ran in the parent would be killed by the OpenMP runtime; there a kernel
   raises instead and names the remedy.
