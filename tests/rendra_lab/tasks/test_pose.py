@@ -89,3 +89,29 @@ def test_a_track_follows_the_camera(compose, tmp_path):
     assert [int(row["frame"]) for row in rows] == [0, 1, 2, 3]
     assert all(float(row["position_percent"]) < 8 for row in rows)
     assert (folder / "exports" / "sequence.gif").is_file()
+
+
+def test_a_frame_to_come_is_seen_from_the_camera_as_it_stands():
+    from functools import partial
+
+    from rendra_lab import losses
+    from rendra_lab.camera_starts import GivenStart
+    from rendra_lab.data.meshes import load_mesh
+    from rendra_lab.data.view_sequences import RenderedSequence
+    from rendra_lab.networks.camera_pose import LookAtPose
+    from rendra_lab.networks.mesh_view import MeshView
+    from rendra_lab.tasks.pose_track.task import PoseTrack
+    from rendra_lab.terms import LossTerm
+
+    scene = MeshView(load_mesh("ico_sphere", level=1), image_size=16)
+    data = RenderedSequence(scene, frames=3)
+    data.setup("fit")
+    terms = {"texture": LossTerm(losses.SummedSquaredError())}
+    task = PoseTrack(scene, LookAtPose(), GivenStart(), 3, losses=terms, optimizer=partial(torch.optim.SGD, lr=0.1))
+    task.pose.place(data.R[:1], data.T[:1])
+    torch.testing.assert_close(task.predict(data.views[2]).T, data.T[:1])
+    task.on_train_batch_end(None, data.views[0], 0)
+    task.frame.fill_(1)
+    task.pose.place(data.R[1:2], data.T[1:2])
+    torch.testing.assert_close(task.predict(data.views[0]).T, data.T[:1])  # finished: from its own pose
+    torch.testing.assert_close(task.predict(data.views[1]).T, data.T[1:2])

@@ -30,7 +30,7 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
         **parts: losses, metrics, optimizer, scheduler of `Task`.
     """
 
-    track_R: Tensor
+    track_R: Tensor  # (N, 3, 3), NaN where no frame was fitted yet, as in track_T (N, 3)
     track_T: Tensor
     frame: Tensor
 
@@ -41,14 +41,15 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
         self.scene = scene
         self.pose = pose
         self.start = start
-        self.register_buffer("track_R", torch.eye(3).repeat(frames, 1, 1))
-        self.register_buffer("track_T", torch.zeros(frames, 3))
+        self.register_buffer("track_R", torch.full((frames, 3, 3), torch.nan))
+        self.register_buffer("track_T", torch.full((frames, 3), torch.nan))
         self.register_buffer("frame", torch.tensor(0))
 
     def predict(self, batch: ViewBatch) -> PosePrediction:
-        """The frame in work from the camera as it stands, any other one from its finished pose."""
+        """A finished frame from its pose; the frame in work, and those to come, from the camera as it stands."""
         frame = int(batch.frame)
-        R, T = self.pose() if frame == int(self.frame) else (self.track_R[frame, None], self.track_T[frame, None])
+        is_finished = frame != int(self.frame) and bool(self.track_T[frame].isfinite().all())
+        R, T = (self.track_R[frame, None], self.track_T[frame, None]) if is_finished else self.pose()
         silhouette, rgb = self.scene(R, T)
         return PosePrediction(rgb, silhouette, R, T)
 
