@@ -79,18 +79,20 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         """Lightning's hook: scores one validation batch under `val/`."""
         self._log_score(batch, "val")
 
-    def test_step(self, batch: BatchT, batch_idx: int) -> None:
-        """Lightning's hook: scores one test batch under `test/`."""
-        self._log_score(batch, "test")
+    def test_step(self, batch: BatchT, batch_idx: int) -> dict[str, Tensor | Metric]:
+        """Lightning's hook: scores one test batch under `test/`; callbacks get the score."""
+        return self._log_score(batch, "test")
 
     def predict_step(self, batch: BatchT, batch_idx: int) -> PredictionT:
         """Lightning's hook: `predict`."""
         return self.predict(batch)
 
-    def _log_score(self, batch: BatchT, stage: str) -> None:
-        scores = {f"{stage}/{name}": value for name, value in self.score(self.predict(batch), batch).items()}
+    def _log_score(self, batch: BatchT, stage: str) -> dict[str, Tensor | Metric]:
+        score = self.score(self.predict(batch), batch)
+        logged = {f"{stage}/{name}": value for name, value in score.items()}
         size = getattr(batch, "batch_size", 1)
-        self.log_dict(scores, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
+        self.log_dict(logged, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
+        return score
 
     @contextmanager
     def _observed(self) -> Iterator[None]:

@@ -16,6 +16,7 @@ from lightning.pytorch.callbacks import ProgressBar
 
 from rendra_lab import report, visualization
 from rendra_lab.base_task import BaseTask
+from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
 
 
@@ -123,19 +124,26 @@ class StepTimer(Callback):
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Starts the clock."""
-        self._start = time.perf_counter()
+        self._start = _now(pl_module.device)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Stops the clock."""
         if self._warm and self._start is not None:
-            self._seconds.append(time.perf_counter() - self._start)
+            self._seconds.append(_now(pl_module.device) - self._start)
         self._warm = True
 
     def median_ms(self) -> float | None:
         """The median of the last ten thousand steps in milliseconds; None before the second step."""
         return round(1000 * statistics.median(self._seconds), 3) if self._seconds else None
+
+
+def _now(device: torch.device) -> float:
+    """The time when all work on the device is done, in seconds."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
 
 
 class LastStepKeeper(Callback):
@@ -194,8 +202,9 @@ class ImageLogger(Callback):
         if not _shows(trainer, pl_module, "panels") or self._batch is None:
             return
         self._write(trainer, pl_module, "final.png")
-        sheet = visualization.story([(f"step {step}", pictures) for step, pictures in _spread(self._shown, 4)])
-        visualization.save_picture(self.folder / "story.png", sheet)
+        if self._shown:
+            sheet = visualization.story([(f"step {step}", pictures) for step, pictures in _spread(self._shown, 4)])
+            visualization.save_picture(self.folder / "story.png", sheet)
         self._batch, self._shown = None, []
 
     def on_validation_batch_end(
@@ -207,8 +216,9 @@ class ImageLogger(Callback):
 
     def _write(self, trainer: Trainer, pl_module: LightningModule, name: str) -> None:
         pictures = _pictures(pl_module, self._batch)
-        self._shown.append((trainer.global_step, pictures))
-        self._publish(trainer, pictures, "train", name)
+        if pictures:
+            self._shown.append((trainer.global_step, pictures))
+            self._publish(trainer, pictures, "train", name)
 
     def _publish(self, trainer: Trainer, pictures: dict[str, np.ndarray], stage: str, name: str) -> None:
         if not pictures:
@@ -357,8 +367,7 @@ class SequenceReport(Callback):
     ) -> None:
         """Keeps one frame and its numbers."""
         if trainer.is_global_zero and isinstance(pl_module, BaseTask):
-            scores = pl_module.score(pl_module.predict(batch), batch)
-            numbers = {name: float(value) for name, value in scores.items() if isinstance(value, torch.Tensor)}
+            numbers = {name: float(value) for name, value in outputs.items() if isinstance(value, torch.Tensor)}
             self._rows.append({"frame": batch_idx, **numbers})
             self._frames.append(visualization.captioned_row(_pictures(pl_module, batch), self.height_px))
 
@@ -377,7 +386,7 @@ class StopWhenSettled(Callback):
         monitor: what Lightning logs, such as `train/loss`.
         below: the fit ends as soon as the value is smaller; None waits for nothing.
         patience: steps without a new best by the share `improvement`; None waits for ever.
-        improvement: smallest gain that counts, as a share of the best value.
+        improvement: smallest gain that counts, as a share of the new value.
     """
 
     def __init__(
@@ -397,9 +406,12 @@ class StopWhenSettled(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Looks at the newest value."""
-        value = float(trainer.callback_metrics[self.monitor])
-        improved = value < self._best * (1 - self.improvement)
+        """Looks at the newest value; UserError where nothing of that name is logged."""
+        known = trainer.callback_metrics
+        if self.monitor not in known:
+            raise UserError(f"StopWhenSettled.monitor: there is no {self.monitor!r}; there are: {', '.join(known)}")
+        value = float(known[self.monitor])
+        improved = self._best - value > self.improvement * abs(value)
         self._waited = 0 if improved else self._waited + 1
         self._best = min(self._best, value)
         low = self.below is not None and value < self.below

@@ -4,6 +4,7 @@ import csv
 import itertools
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,12 +12,14 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from PIL import Image
 from rendra_lab_toy import ToyData, ToyTask
+from torchmetrics import Metric
 
-from rendra_lab import losses
+from rendra_lab import losses, metrics
 from rendra_lab.base_task import BaseTask
-from rendra_lab.callbacks import AnimationWriter, ImageLogger, Progress
+from rendra_lab.callbacks import AnimationWriter, ImageLogger, Progress, SequenceReport, StepTimer, StopWhenSettled
+from rendra_lab.errors import UserError
 from rendra_lab.loggers import CsvTable, TensorBoard
-from rendra_lab.terms import LossTerm
+from rendra_lab.terms import LossTerm, MetricTerm
 
 
 def fit(*callbacks: Callback, steps: int, task: Any = None, **settings: Any) -> None:
@@ -97,3 +100,79 @@ def test_an_unused_events_file_is_never_made(tmp_path: Path) -> None:
     logger.finalize("success")
     logger.close()
     assert not (tmp_path / "run").exists()
+
+
+class Shy(ToyTask):
+    """Could draw, but has nothing to show."""
+
+    def panels(self, prediction: Any, batch: Any) -> dict[str, torch.Tensor]:
+        return {}
+
+
+def test_a_task_without_panels_today_ends_well(tmp_path: Path) -> None:
+    shy = Shy(losses={"t": LossTerm(losses.SquaredError())}, optimizer=partial(torch.optim.SGD, lr=0.1))
+    fit(ImageLogger(str(tmp_path), every_n_steps=1), AnimationWriter(str(tmp_path / "fit.gif")), steps=3, task=shy)
+    assert list(tmp_path.iterdir()) == []
+
+
+class BatchCounter(Metric):
+    """Counts its updates."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("seen", torch.tensor(0.0), dist_reduce_fx="sum")
+
+    def update(self, prediction: torch.Tensor, target: torch.Tensor) -> None:
+        self.seen += 1
+
+    def compute(self) -> torch.Tensor:
+        return self.seen
+
+
+def test_a_report_scores_no_batch_twice(tmp_path: Path) -> None:
+    toy = ToyTask(
+        losses={"t": LossTerm(losses.SquaredError())},
+        optimizer=partial(torch.optim.SGD, lr=0.1),
+        metrics={"seen": MetricTerm(BatchCounter()), "psnr": MetricTerm(metrics.psnr)},
+    )
+    silent = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    trainer = Trainer(accelerator="cpu", callbacks=[SequenceReport(str(tmp_path))], **silent)
+    trainer.test(toy, datamodule=ToyData(), verbose=False)
+    assert trainer.callback_metrics["test/seen"] == 1
+    row = next(csv.DictReader((tmp_path / "frames.csv").read_text().splitlines()))
+    assert float(row["psnr"]) == pytest.approx(float(trainer.callback_metrics["test/psnr"]))
+
+
+def steps_until_settled(values: list[float], **settings: Any) -> int:
+    stop = StopWhenSettled("train/loss", **settings)
+    trainer = SimpleNamespace(callback_metrics={}, should_stop=False)
+    for step, value in enumerate(values):
+        trainer.callback_metrics["train/loss"] = torch.tensor(value)
+        stop.on_train_batch_end(trainer, None, None, None, step)  # type: ignore[arg-type]
+        if trainer.should_stop:
+            return step
+    return len(values)
+
+
+@pytest.mark.parametrize("sign", [0.0, -10.0])
+def test_a_fit_settles_whatever_the_sign_of_its_loss(sign: float) -> None:
+    """Two gains, then losses that only grow worse."""
+    assert steps_until_settled([sign + x for x in (5.0, 4.0, 3.0, 3.005, 3.006, 3.007, 3.008)], patience=3) == 5
+
+
+def test_a_monitor_that_is_not_logged_is_named() -> None:
+    stop = StopWhenSettled("train/los")
+    trainer = SimpleNamespace(callback_metrics={"train/loss": torch.tensor(1.0)}, should_stop=False)
+    with pytest.raises(UserError, match=r"no 'train/los'; there are: train/loss"):
+        stop.on_train_batch_end(trainer, None, None, None, 0)  # type: ignore[arg-type]
+
+
+def test_the_clock_waits_for_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited = []
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+    module, timer = SimpleNamespace(device=torch.device("cuda", 1)), StepTimer()
+    for step in range(2):
+        timer.on_train_batch_start(None, module, None, step)  # type: ignore[arg-type]
+        timer.on_train_batch_end(None, module, None, None, step)  # type: ignore[arg-type]
+    assert waited[-2:] == [module.device] * 2
+    assert timer.median_ms() is not None
