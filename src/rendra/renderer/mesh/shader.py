@@ -226,11 +226,16 @@ class SplatterPhongShader(ShaderBase):
         samples = fragments.detach()  # fixed on the surface: they move with it, not with the pixel grid
         texels = meshes.sample_textures(samples)
         colors, points = phong_shading_with_points(meshes, samples, texels=texels, **scene)
-        n, h, w, k = samples.pix_to_face.shape
-        if self.splatter_blender is None or self.splatter_blender.input_shape != (n, h, w, k):
-            self.splatter_blender = SplatterBlender((n, h, w, k), colors.device)
-        empty = samples.pix_to_face < 0
-        return self.splatter_blender(colors, points, scene["cameras"], empty, blend_params)
+        blender = self._blender_for(samples.pix_to_face)
+        return blender(colors, points, scene["cameras"], samples.pix_to_face < 0, blend_params)
+
+    def _blender_for(self, pix_to_face: Tensor) -> SplatterBlender:
+        """The blender of the last call, or a new one where size or device have changed."""
+        n, h, w, k = pix_to_face.shape
+        kept = self.splatter_blender
+        if kept is None or kept.input_shape != (n, h, w, k) or kept.pixel_centres.device != pix_to_face.device:
+            self.splatter_blender = kept = SplatterBlender((n, h, w, k), pix_to_face.device)
+        return kept
 
     @staticmethod
     def check_blend_params(blend_params: BlendParams) -> None:

@@ -343,6 +343,13 @@ def test_silhouette_takes_overrides() -> None:
     assert renderer(ico_sphere(1), raster_settings=RasterizationSettings(9)).shape == (1, 9, 9, 4)
 
 
+def test_a_splatter_follows_its_input_to_another_device() -> None:
+    renderer, sphere = renderer_of(SplatterPhongShader, view()), painted(ico_sphere(0))
+    image = renderer(sphere)
+    renderer.shader.splatter_blender = renderer.shader.splatter_blender.to("meta")  # as left by a call elsewhere
+    assert_close(renderer(sphere), image)
+
+
 def test_moving_moves_all_parts() -> None:
     renderer = renderer_of(SplatterPhongShader, view())
     renderer(painted(ico_sphere(0)))
