@@ -88,7 +88,8 @@ def _map_value(value: Any, move: Callable[[Any], Any], movable: Callable[[Any], 
     if isinstance(value, Mapping):
         return {key: _map_value(item, move, movable) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(_map_value(item, move, movable) for item in value)
+        items = [_map_value(item, move, movable) for item in value]
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
     return value
 
 

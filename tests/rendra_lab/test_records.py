@@ -1,7 +1,7 @@
 """Records move, detach and stack field by field, and name their fields when asked for others."""
 
 from dataclasses import FrozenInstanceError, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -66,3 +66,19 @@ def test_a_missing_field_names_those_that_exist() -> None:
         read_field(Inner(torch.zeros(1)), "rgb", "prediction")
     with pytest.raises(FieldError, match=r"batch \(dict\) has no field 'rgb'; it has: a"):
         read_field({"a": 1}, "rgb", "batch")
+
+
+class Pair(NamedTuple):
+    left: Tensor
+    right: Tensor
+
+
+@dataclass(frozen=True)
+class Holder(TensorRecord):
+    pair: Pair
+
+
+def test_named_tuples_stay_what_they_are() -> None:
+    moved = Holder(Pair(torch.ones(2), torch.zeros(2))).to(torch.float64)
+    assert isinstance(moved.pair, Pair)
+    assert moved.pair.left.dtype == torch.float64
