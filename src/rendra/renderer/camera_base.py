@@ -116,8 +116,7 @@ class CamerasBase(TensorProperties):
         Args:
             points: (P, 3) or (N, P, 3).
             eps: as in `transform_points`.
-            with_xyflip: False keeps +X left and +Y up, the origin in the middle of... the opposite corner:
-                minus the flipped coordinates.
+            with_xyflip: False keeps +X left and +Y up: minus the flipped coordinates.
             **kwargs: fields to replace; `image_size` ((H, W),) if the camera has none.
 
         Raises:

@@ -126,8 +126,8 @@ class _FoVCameras(_MatrixCameras):
         Args:
             xy_depth: (P, 3) or (N, P, 3): x and y in NDC, and depth.
             world_coordinates: return world points; False: view points.
-            scaled_depth_input: depth is the projected one, in [0, 1] from near to far; False: it is
-            view-space z. **kwargs: fields to replace.
+            scaled_depth_input: depth is the projected one, in [0, 1] from near to far; False: view-space z.
+            **kwargs: fields to replace.
 
         Returns:
             The points, shaped as by `transform_points`.

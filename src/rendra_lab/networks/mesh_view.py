@@ -107,8 +107,8 @@ class MeshView(nn.Module):
         }
 
     def _follow(self, device: torch.device) -> None:
-        if self.mesh.device != device:
-            self.mesh, self.lights = self.mesh.to(device), self.lights.to(device)
+        # the lights are a submodule and may have moved with the task, without the mesh
+        self.mesh, self.lights = self.mesh.to(device), self.lights.to(device)
 
 
 def _height_width(image_size: int | Sequence[int]) -> tuple[int, int]:
