@@ -1,5 +1,7 @@
 """The meshes that tasks and scripts start from: made here, or read from the user's file."""
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -7,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rendra.io import IO, load_objs_as_meshes
+from rendra.io import IO, load_obj, load_objs_as_meshes
 from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra.utils.ico_sphere import ico_sphere
@@ -16,6 +18,8 @@ from rendra_lab.synthesis.cow import CoatParameters, CowParameters, make_cow
 
 Device = torch.device | str
 NORMALIZATIONS = ("center", "extent", "max_abs")
+_ATLAS_TEXELS = 2**22  # of all faces together
+_FACE_TEXELS = 32  # most along one side of a face
 
 
 def load_mesh(
@@ -40,7 +44,8 @@ def load_mesh(
             build (a mapping of CowParameters' fields). ico_sphere: level. torus: r, R, sides, rings.
 
     Returns:
-        A batch of one mesh; white vertex colours where the file has none.
+        A batch of one mesh; white vertex colours where the file has none. An OBJ file with several images, or with
+        materials of plain colours, has a TexturesAtlas: each face in its own material.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -76,11 +81,27 @@ def make_cube(device: Device = "cpu") -> Meshes:
 def _read(path: Path, device: Device) -> Meshes:
     if not path.is_file():
         raise FileNotFoundError(f"there is no mesh file {path}{' (it is a folder)' if path.is_dir() else ''}")
-    is_obj = path.suffix.lower() == ".obj"
-    mesh = load_objs_as_meshes([path], device=device) if is_obj else IO().load_mesh(path, device=device)
+    mesh = _read_obj(path, device) if path.suffix.lower() == ".obj" else IO().load_mesh(path, device=device)
     if not len(mesh.faces_packed()):
         raise ValueError(f"{path} holds no faces, so there is nothing to see")
     return mesh
+
+
+def _read_obj(path: Path, device: Device) -> Meshes:
+    """One image as it is, vertex colours as they are, any other materials as an atlas."""
+    _, faces, parts = load_obj(path, device=device)
+    images, colours = parts.texture_images or {}, parts.material_colors or {}
+    bare = len(faces.materials_idx.unique()) > len(images)  # images belong to materials that are in use
+    plain = bare and any("diffuse_color" in each for each in colours.values())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # load_obj gave them already
+        mesh = load_objs_as_meshes([path], device=device)
+        needs_atlas = len(images) > 1 or plain or (images and mesh.textures is None)
+        if not needs_atlas or isinstance(mesh.textures, TexturesVertex):
+            return mesh
+        texels = math.isqrt(_ATLAS_TEXELS // max(1, len(faces.verts_idx))) if images else 1
+        texels = min(max(1, texels), _FACE_TEXELS)
+        return load_objs_as_meshes([path], device, create_texture_atlas=True, texture_atlas_size=texels)
 
 
 def _make(name: str, options: Mapping[str, Any], device: Device) -> Meshes:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from assertions import assert_close
+from PIL import Image
 
 from rendra.io import IO, save_obj, save_ply
-from rendra.renderer.mesh.textures import TexturesUV, TexturesVertex
+from rendra.renderer.mesh.textures import TexturesAtlas, TexturesUV, TexturesVertex
 from rendra_lab.data.meshes import bounding_sphere, load_mesh, make_cube
 
 TRIANGLE = torch.tensor([[1.0, 1, 1], [3, 1, 1], [1, 5, 1]])
@@ -107,3 +108,35 @@ def test_mistakes_are_named(tmp_path: Path, triangle: Path) -> None:
     save_obj(tmp_path / "dot.obj", torch.ones(3, 3), torch.tensor([[0, 1, 2]]))
     with pytest.raises(ValueError, match="single point"):
         load_mesh(path=tmp_path / "dot.obj", normalize="extent")
+
+
+def write_obj(folder: Path, materials: str, body: str) -> Path:
+    (folder / "two.mtl").write_text(materials)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (folder / "two.obj").write_text(f"mtllib two.mtl\n{corners}{body}")
+    return folder / "two.obj"
+
+
+def test_materials_of_plain_colours_are_seen(tmp_path: Path) -> None:
+    materials = "newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\nnewmtl unused\nKd 0 1 0\n"
+    path = write_obj(tmp_path, materials, "usemtl red\nf 1 2 3\nusemtl blue\nf 2 4 3\n")
+    textures = load_mesh(path=path).textures
+    assert isinstance(textures, TexturesAtlas)
+    assert_close(textures.atlas_packed().mean((1, 2)), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("second", ["map_Kd blue.png", "Kd 0 0 1"])
+def test_an_image_and_another_material_are_both_seen(tmp_path: Path, second: str) -> None:
+    for name, colour in {"red": (255, 0, 0), "blue": (0, 0, 255)}.items():
+        Image.new("RGB", (4, 4), colour).save(tmp_path / f"{name}.png")
+    materials = f"newmtl a\nmap_Kd red.png\nnewmtl b\n{second}\n"
+    path = write_obj(tmp_path, materials, "usemtl a\nf 1/1 2/2 3/3\nusemtl b\nf 2/1 4/2 3/3\n")
+    textures = load_mesh(path=path).textures
+    assert_close(textures.atlas_packed().mean((1, 2)), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_an_unused_material_leaves_the_only_image_as_it_is(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(tmp_path / "red.png")
+    materials = "newmtl a\nmap_Kd red.png\nnewmtl unused\nKd 0 1 0\n"
+    path = write_obj(tmp_path, materials, "usemtl a\nf 1/1 2/2 3/3\nf 2/1 4/2 3/3\n")
+    assert isinstance(load_mesh(path=path).textures, TexturesUV)
