@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rendra.transforms import euler_angles_to_matrix
-from rendra_lab.data.views import ViewBatch, shrink
+from rendra_lab.data.views import ViewBatch, check_visible, shrink
 from rendra_lab.networks.camera_pose import CameraPose, PosePrediction, SixDofPose, look_at_origin
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.optimizers import levenberg_marquardt_step
@@ -44,11 +44,14 @@ class GivenStart:
             raise ValueError(f"a start position has three coordinates and is not the origin, got {list(position)}")
         self.position = [float(x) for x in position]
 
+    @torch.no_grad()
     def __call__(
         self, scene: MeshView, pose: CameraPose, target: ViewBatch, residuals: Residuals
     ) -> tuple[Tensor, Tensor]:
-        """The pose R (1, 3, 3), T (1, 3)."""
-        return look_at_origin(torch.tensor([self.position], device=target.rgb.device))
+        """The pose R (1, 3, 3), T (1, 3); UserError where nothing is seen from there, so that nothing pulls."""
+        R, T = look_at_origin(torch.tensor([self.position], device=target.rgb.device))
+        check_visible(scene(R, T)[0], scene, f"the start, seen from init.position={self.position}")
+        return R, T
 
 
 class MultiStart:

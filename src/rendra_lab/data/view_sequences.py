@@ -9,7 +9,7 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from rendra.renderer.cameras import look_at_view_transform
-from rendra_lab.data.views import ViewBatch, render_views
+from rendra_lab.data.views import ViewBatch, check_visible, render_views
 from rendra_lab.networks.mesh_view import MeshView
 
 
@@ -67,8 +67,9 @@ class RenderedSequence(LightningDataModule):
         self.R, self.T = look_at_view_transform(distances, elevations, azimuths)
 
     def setup(self, stage: str) -> None:
-        """Lightning's hook: renders the views."""
+        """Lightning's hook: renders the views; UserError where one shows nothing."""
         views = render_views(self.scene, self.R, self.T)
+        check_visible(views.silhouette, self.scene, "a frame of the sequence (data.distance)")
         self.views = [views.select(i) for i in range(len(self.R))]
         self.target = self.views[0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from rendra_lab.errors import UserError
 from rendra_lab.networks.camera_pose import camera_centre
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.records import TensorRecord
+
+log = logging.getLogger(__name__)
 
 _HARD_EDGE = 1e-9  # squared NDC: a small fraction of a pixel
 
@@ -62,6 +65,33 @@ def render_views(scene: MeshView, R: Tensor, T: Tensor) -> ViewBatch:
     views = [scene(R[i : i + 1], T[i : i + 1], sigma=_HARD_EDGE) for i in range(len(R))]
     silhouettes = torch.cat([(silhouette > 0.5).float() for silhouette, _ in views])
     return ViewBatch(torch.cat([rgb for _, rgb in views]), silhouettes, R, T, torch.arange(len(R)).float())
+
+
+def check_visible(silhouettes: Tensor, scene: MeshView, view: str) -> None:
+    """Refuse views that hold nothing of the mesh, and warn of those that hold nothing else.
+
+    Args:
+        silhouettes: (B, H, W), coverage in [0, 1].
+        scene: whose mesh it is.
+        view: what to call the views: "the target (data.distance=3.0)".
+
+    Raises:
+        UserError: a view is empty.
+    """
+    covered = silhouettes.detach().flatten(1)
+    if not bool((covered.amax(1) > 0.5).all()):
+        raise UserError(f"nothing of the mesh is seen in {view}: {_whereabouts(scene)}")
+    if bool((covered.amin(1) > 0.5).any()):
+        log.warning("the mesh fills %s, so that it has no outline to fit: %s", view, _whereabouts(scene))
+
+
+def _whereabouts(scene: MeshView) -> str:
+    verts = scene.mesh.verts_packed()
+    low, high = (" ".join(f"{x:.4g}" for x in corner.tolist()) for corner in (verts.amin(0), verts.amax(0)))
+    return (
+        f"the camera looks at the origin, and the mesh reaches from ({low}) to ({high}); mesh.normalize=extent moves "
+        "it to the origin and makes it 2 units large, mesh.normalize=center only moves it"
+    )
 
 
 class SingleView(LightningDataModule):
@@ -109,10 +139,12 @@ class RenderedView(SingleView):
     ) -> None:
         super().__init__(scene, steps)
         self.R, self.T = look_at_view_transform(distance, elevation_deg, azimuth_deg)
+        self.name = f"the target, seen from a distance of {distance:g} (data.distance)"
 
     def setup(self, stage: str) -> None:
-        """Lightning's hook: renders the view."""
+        """Lightning's hook: renders the view; UserError where it shows nothing."""
         self.target = render_views(self.scene, self.R, self.T)
+        check_visible(self.target.silhouette, self.scene, self.name)
 
 
 class PhotoView(SingleView):

@@ -6,6 +6,7 @@ import torch
 from assertions import assert_close
 from PIL import Image
 
+from rendra_lab.camera_starts import GivenStart
 from rendra_lab.data.meshes import load_mesh
 from rendra_lab.data.view_sequences import FrameByFrame, RenderedSequence
 from rendra_lab.data.views import PhotoView, RenderedView, read_photo
@@ -93,3 +94,31 @@ def test_a_resumed_sequence_goes_on_where_it_was(scene):
     data = RenderedSequence(scene, frames=3, steps_per_frame=2)
     data.setup("fit")
     assert [int(batch.frame) for batch in FrameByFrame(data.views, 2, lambda: 3)] == [1, 2, 2]
+
+
+def empty_views(scene):
+    """Everything that looks for a mesh which is not there."""
+    target = RenderedView(MeshView(load_mesh("cube"), image_size=16))
+    target.setup("fit")
+    return {
+        "data.distance": lambda: RenderedView(scene).setup("fit"),
+        "a frame": lambda: RenderedSequence(scene, frames=2).setup("fit"),
+        "init.position": lambda: GivenStart()(scene, None, target.target, None),
+    }
+
+
+@pytest.mark.parametrize("what", ["data.distance", "a frame", "init.position"])
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, 500.0), (1e-4, 0.0)])
+def test_a_view_without_the_mesh_is_refused_with_a_way_out(what, scale, shift):
+    mesh = load_mesh("cube").scale_verts(scale).offset_verts(torch.tensor([shift, 0.0, 0.0]))
+    scene = MeshView(mesh, image_size=16)
+    with pytest.raises(UserError, match=f"nothing of the mesh is seen.*{what}.*mesh.normalize=extent"):
+        empty_views(scene)[what]()
+
+
+def test_a_view_full_of_the_mesh_is_warned_of(caplog):
+    RenderedView(MeshView(load_mesh("cube").scale_verts(100.0), image_size=16)).setup("fit")
+    assert "no outline to fit" in caplog.text
+    caplog.clear()
+    RenderedView(MeshView(load_mesh("cube"), image_size=16)).setup("fit")
+    assert not caplog.text
