@@ -81,7 +81,7 @@ def check_visible(silhouettes: Tensor, scene: MeshView, view: str) -> None:
     covered = silhouettes.detach().flatten(1)
     if not bool((covered.amax(1) > 0.5).all()):
         raise UserError(f"nothing of the mesh is seen in {view}: {_whereabouts(scene)}")
-    if bool((covered.amin(1) > 0.5).any()):
+    if bool((covered.mean(1) > 0.995).any()):
         log.warning("the mesh fills %s, so that it has no outline to fit: %s", view, _whereabouts(scene))
 
 
@@ -139,12 +139,12 @@ class RenderedView(SingleView):
     ) -> None:
         super().__init__(scene, steps)
         self.R, self.T = look_at_view_transform(distance, elevation_deg, azimuth_deg)
-        self.name = f"the target, seen from a distance of {distance:g} (data.distance)"
+        self._view = f"the target, seen from a distance of {distance:g} (data.distance)"
 
     def setup(self, stage: str) -> None:
         """Lightning's hook: renders the view; UserError where it shows nothing."""
         self.target = render_views(self.scene, self.R, self.T)
-        check_visible(self.target.silhouette, self.scene, self.name)
+        check_visible(self.target.silhouette, self.scene, self._view)
 
 
 class PhotoView(SingleView):
@@ -198,7 +198,8 @@ def read_photo(image: str | Path, mask: str | Path | None = None) -> tuple[Tenso
     colours = np.asarray(picture.convert("RGBA").convert("RGB"), np.float32) / 255
     covered = np.asarray(coverage, np.float32) / 255
     if not covered.max() > 0.5:
-        raise UserError(f"the mask of {image} is empty: there is nothing to fit")
+        brightest = f"its brightest pixel is {round(255 * float(covered.max()))} of 255"
+        raise UserError(f"the mask of {image} is empty, there is nothing to fit: {brightest}")
     return torch.from_numpy(colours), torch.from_numpy(covered)
 
 
@@ -208,9 +209,16 @@ def _open(path: str | Path) -> Image.Image:
     try:
         with Image.open(path) as picture:
             picture.load()
-            return ImageOps.exif_transpose(picture)
+            return _in_8_bits(ImageOps.exif_transpose(picture))
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError, SyntaxError) as error:
         raise UserError(f"{path} is not an image that can be read: {error}") from error
+
+
+def _in_8_bits(picture: Image.Image) -> Image.Image:
+    """A grey picture of 16 bits scaled to 8, which Pillow would clip; any other as it is."""
+    if not picture.mode.startswith("I"):
+        return picture
+    return Image.fromarray((np.asarray(picture, np.float32) / 257).round().clip(0, 255).astype(np.uint8))
 
 
 def _fit_into(rgba: Tensor, size: tuple[int, int]) -> Tensor:

@@ -122,3 +122,17 @@ def test_a_view_full_of_the_mesh_is_warned_of(caplog):
     caplog.clear()
     RenderedView(MeshView(load_mesh("cube"), image_size=16)).setup("fit")
     assert not caplog.text
+
+
+def test_grey_pictures_of_16_bits_keep_their_shades(tmp_path):
+    ramp = np.linspace(0, 65535, 200).astype(np.uint16).reshape(10, 20)
+    Image.fromarray(ramp).save(tmp_path / "grey.png")
+    colours, covered = read_photo(tmp_path / "grey.png", tmp_path / "grey.png")
+    assert_close(covered, torch.from_numpy(ramp / np.float32(65535)), atol=0.003)
+    assert_close(colours, covered[..., None].expand(-1, -1, 3))
+
+
+def test_a_mask_of_zeros_and_ones_is_told_its_range(tmp_path):
+    Image.fromarray(np.ones((4, 4), np.uint8)).save(tmp_path / "mask.png")
+    with pytest.raises(UserError, match="brightest pixel is 1 of 255"):
+        read_photo(tmp_path / "mask.png", tmp_path / "mask.png")
