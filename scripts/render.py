@@ -22,7 +22,7 @@ def main(cfg: Any) -> None:
         light=parts["light"],
         material=parts["material"],
         shading=parts["shader"],
-        size=(cfg.height or cfg.size, cfg.width or cfg.size),
+        size=tuple(cfg.size if side is None else side for side in (cfg.height, cfg.width)),
         background=pictures.parse_color(cfg.background),
         antialias=cfg.antialias,
     )

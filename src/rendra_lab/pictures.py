@@ -164,10 +164,13 @@ class Studio:
     antialias: int = 2
 
     def __post_init__(self) -> None:
-        if min(self.size) < 1 or max(self.size) > 8192:
-            raise ValueError(f"width and height must lie from 1 to 8192 pixels, got {self.size[1]} x {self.size[0]}")
-        if not 1 <= self.antialias <= 8:
-            raise ValueError(f"antialias must lie from 1 to 8, got {self.antialias!r}")
+        height, width = self.size
+        if not all(isinstance(side, int) and 1 <= side <= 8192 for side in self.size):
+            raise ValueError(
+                f"size, width and height must be whole pixels from 1 to 8192, got {width!r} x {height!r}"
+            )
+        if not (isinstance(self.antialias, int) and 1 <= self.antialias <= 8):
+            raise ValueError(f"antialias must be a whole number from 1 to 8, got {self.antialias!r}")
 
     @torch.no_grad()
     def render(self, mesh: Meshes) -> Tensor:
@@ -241,7 +244,7 @@ def draw(kind: str, studio: Studio, mesh: Meshes, output: Path, frames: int = 36
         return f"turntable of {what}, {frames} frames"
     if kind == "gallery":
         save_image(output, torch.from_numpy(gallery(studio, mesh) / 255.0), transparent=False)
-        return f"six lightings of {what}"
+        return f"six lightings of {what}{_out_of_place(mesh)}"
     image = studio.render(mesh)
     if kind == "cutout":
         image = cut_out(image, studio.background)
@@ -249,6 +252,13 @@ def draw(kind: str, studio: Studio, mesh: Meshes, output: Path, frames: int = 36
     size = f"{studio.size[1]} x {studio.size[0]} pixels"
     seen = "" if studio.sees(mesh) else "; NOTHING IS SEEN: leave camera.dist and camera.at at null, or move them"
     return f"{what}, {size}{seen}"
+
+
+def _out_of_place(mesh: Meshes) -> str:
+    """What to say of a mesh that does not suit the gallery's cameras, which stand 2.7 from the origin."""
+    centre, radius = bounding_sphere(mesh)
+    suits = 0.1 < float(centre.norm()) + radius < 2.7 and float(centre.norm()) < 1
+    return "" if suits else "; the cameras stand 2.7 from the origin, so this mesh needs mesh.normalize=extent"
 
 
 def _demand_writable(kind: str, output: Path) -> None:
@@ -277,8 +287,8 @@ def turntable(studio: Studio, mesh: Meshes, frames: int) -> Iterator[Picture]:
     Raises:
         ValueError: fewer than two frames.
     """
-    if frames < 2:
-        raise ValueError(f"a turntable needs at least 2 frames, got {frames}")
+    if not (isinstance(frames, int) and frames >= 2):
+        raise ValueError(f"a turntable needs at least 2 frames, got {frames!r}")
     for frame in range(frames):
         camera = replace(studio.camera, azim=studio.camera.azim + 360 * frame / frames)
         yield to_picture(replace(studio, camera=camera).render(mesh)[..., :3])

@@ -212,12 +212,23 @@ def test_mistakes_are_named(make, message: str) -> None:
         make()
 
 
-@pytest.mark.parametrize("change", [{"size": (0, 5)}, {"size": (9000, 5)}, {"antialias": 0}])
+@pytest.mark.parametrize(
+    "change", [{"size": (0, 5)}, {"size": (9000, 5)}, {"size": ("a", 5)}, {"antialias": 0}, {"antialias": "2x"}]
+)
 def test_impossible_pictures_are_refused(studio: Studio, change: dict) -> None:
-    with pytest.raises(ValueError, match="must lie from 1 to"):
+    with pytest.raises(ValueError, match="from 1 to"):
         replace(studio, **change)
 
 
 def test_ambient_light_shows_the_texture_as_it_is(studio: Studio) -> None:
     image = replace(studio, light=AmbientLights()).render(load_mesh("cube"))
     assert_close(image[..., :3], torch.ones(48, 48, 3))
+
+
+@pytest.mark.parametrize(("scale", "shift", "fits"), [(1.0, 0.0, True), (100.0, 0.0, False), (1.0, 9.0, False)])
+def test_the_gallery_says_when_a_mesh_is_out_of_place(
+    studio: Studio, tmp_path: Path, scale: float, shift: float, fits: bool
+) -> None:
+    mesh = load_mesh("cube").scale_verts(scale).offset_verts(torch.tensor([shift, 0.0, 0.0]))
+    note = draw("gallery", studio, mesh, tmp_path / "gallery.png")
+    assert ("mesh.normalize=extent" in note) is not fits
