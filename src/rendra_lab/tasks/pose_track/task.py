@@ -65,7 +65,8 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
             self.pose.place(*(x.detach() for x in self.pose()))
             self.frame.fill_(int(batch.frame))
             for optimizer in self.trainer.optimizers:
-                optimizer.state = defaultdict(dict)  # what it knew was the last frame's
+                # Adam's moments were the last frame's; Levenberg-Marquardt's settled widths stay, in its groups
+                optimizer.state = defaultdict(dict)
         super().on_train_batch_start(batch, batch_idx)
 
     def on_train_batch_end(self, outputs: Any, batch: ViewBatch, batch_idx: int) -> None:
