@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,7 +105,7 @@ def run(cfg: DictConfig) -> float | None:
     record = _opening_record(cfg)
     try:
         experiment = build(cfg)
-        checkpoint = find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root))
+        checkpoint = _whole(find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root)))
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
         with _own_processes(experiment):
@@ -152,6 +153,7 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
         OmegaConf.update(cfg, key, value)
     experiment = build(cfg, observers=False)
     checkpoint = newest_checkpoint(folder) if weights == "last" else _named_checkpoint(folder, weights)
+    _whole(checkpoint)
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     experiment.data.prepare_data()
     experiment.data.setup("test")
@@ -188,6 +190,13 @@ def newest_checkpoint(folder: Path, besides: Path | None = None) -> Path:
     if not found:
         raise UserError(f"there is no checkpoint under {report.short_path(folder)}; start without ckpt_path")
     return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name == "last.ckpt"))
+
+
+def _whole(checkpoint: Path | None) -> Path | None:
+    """The checkpoint itself, if its archive has an end."""
+    if checkpoint is not None and not zipfile.is_zipfile(checkpoint):
+        raise UserError(f"ckpt_path: {checkpoint} is cut off, or no checkpoint: take an older one of its folder")
+    return checkpoint
 
 
 def _interruption(error: BaseException) -> int | None:
@@ -357,7 +366,7 @@ def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
     """The numbers, words and switches that distinguish runs, by dotted key, for TensorBoard's HPARAMS tab."""
-    skipped = {"trainer", "logger", "callbacks", "module", "run_dir", "output_root", "ckpt_path", "direction"}
+    skipped = {"trainer", "logger", "callbacks", "run_dir", "output_root", "ckpt_path", "direction"}
     tree = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(tree, dict)
     tree["module"] = {
@@ -365,7 +374,6 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
         for key, value in tree["module"].items()
         if key not in ("losses", "metrics", "optimizer", "scheduler")
     }
-    skipped.discard("module")
     flat = {key: value for name in tree if name not in skipped for key, value in _leaves(tree[name], str(name))}
     return {**flat, "trainer.max_steps": tree["trainer"].get("max_steps")}
 
