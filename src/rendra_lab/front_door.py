@@ -52,12 +52,15 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     except Exception as error:
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
-        if verbose or not isinstance(error, _WORDED):
+        config_dir = Path(script).resolve().parent / config_path
+        mistyped = None if verbose or isinstance(error, _MISTAKES) else mistyped_value(config_dir, config_name)
+        if verbose or not (mistyped or isinstance(error, _WORDED)):
             raise
-        message = explain(error, Path(script).resolve().parent / config_path, config_name)
+        message = mistyped or explain(error, config_dir, config_name)
         sys.stderr.write(f"{Path(script).name}: {message}\n")
         before_the_run = FailureKeeper.failure is None
-        sys.exit(_EXIT_MISTAKE if before_the_run or isinstance(error, _MISTAKES) else _EXIT_FAILURE)
+        is_mistake = before_the_run or mistyped or isinstance(error, _MISTAKES)
+        sys.exit(_EXIT_MISTAKE if is_mistake else _EXIT_FAILURE)
     except BaseException:  # an interrupted sweep has its table too
         conclude_sweep()
         raise
@@ -94,6 +97,21 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
         key = getattr(error, "full_key", None) or missing[1]
         return f"{key} needs a value: {key}=..."
     return _plain(error)
+
+
+def mistyped_value(config_dir: Path, config_name: str) -> str | None:
+    """One line about a word on the command line that stands for a number; None where there is no such word."""
+    from hydra import compose
+
+    chosen = [item for item in sys.argv[1:] if _chooses_group(item, config_dir)]
+    with _hydra(config_dir), contextlib.suppress(HydraException, OmegaConfBaseException, ValueError):
+        usual = compose(config_name, overrides=[*_search_path(), *chosen])
+        given = compose(config_name, overrides=[item for item in sys.argv[1:] if not item.startswith("-")])
+        for key in (item.partition("=")[0] for item in sys.argv[1:] if item not in chosen and "=" in item):
+            number, word = OmegaConf.select(usual, key), OmegaConf.select(given, key)
+            if isinstance(number, int | float) and isinstance(word, str):
+                return f"{key} must be {'true or false' if isinstance(number, bool) else 'a number'}, got {word!r}"
+    return None
 
 
 def known_keys(config_dir: Path, config_name: str) -> list[str]:

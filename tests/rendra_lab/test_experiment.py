@@ -233,3 +233,12 @@ def test_numbers_that_nobody_measured_cannot_be_optimised(compose: Compose, tmp_
         run(compose(tmp_path / "toy" / "run", "task=toy", "debug=fast", "optimized_metric=test/lpips"))
     with pytest.raises(UserError, match="seed must be a whole number, got 'x'"):
         build(compose(tmp_path / "toy" / "run", "task=toy", "seed=x"))
+
+
+def test_a_checkpoint_that_is_cut_off_is_told(compose, tmp_path):
+    first = tmp_path / "toy" / "1"
+    run(compose(first, "task=toy", "trainer.max_steps=2"))
+    checkpoint = first / "checkpoints" / "last.ckpt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+    with pytest.raises(UserError, match="is cut off, or no checkpoint"):
+        run(compose(tmp_path / "toy" / "2", "task=toy", f"ckpt_path={checkpoint}"))

@@ -44,6 +44,7 @@ def test_help_lists_the_groups_without_loading_torch() -> None:
         ("ckpt_path=last", "there is no checkpoint under outputs/toy; start without ckpt_path"),
         ("loss.texture.weight=${nothing}", "Interpolation key 'nothing' not found"),
         ("trainer.max_steps=many", "trainer: "),
+        ("optimizer.lr=much", "optimizer.lr must be a number, got 'much'"),
     ],
 )
 def test_mistakes_are_answered_in_one_line(argument: str, answer: str, train: Train) -> None:
