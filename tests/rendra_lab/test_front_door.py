@@ -64,6 +64,14 @@ def test_a_bug_shows_its_traceback(train: Train, tmp_path: Path) -> None:
     assert "the toy broke as told" in log.read_text()
 
 
+def test_a_run_may_leave_out_the_metric_that_its_task_optimises(train: Train) -> None:
+    code, _, _ = train("metric=[]", "debug=fast")
+    assert code == 0
+    code, _, err = train("metric=[]", "debug=fast", "optimized_metric=test/psnr")
+    assert code == 2
+    assert "this run has no 'test/psnr'" in err
+
+
 def test_two_runs_of_one_moment_have_two_folders(train: Train, tmp_path: Path) -> None:
     for _ in range(2):
         assert train("debug=fast", "callbacks=[timer]")[0] == 0
