@@ -54,6 +54,8 @@ class MeshView(nn.Module):
         super().__init__()
         if len(mesh) != 1:
             raise ValueError(f"a MeshView shows one mesh, got a batch of {len(mesh)}")
+        if not 0 < fov_deg < 180:
+            raise ValueError(f"fov_deg must lie between 0 and 180 degrees, got {fov_deg!r}")
         self.mesh = mesh
         self.image_size = _height_width(image_size)
         self.fov_deg = fov_deg
@@ -112,7 +114,7 @@ class MeshView(nn.Module):
 
 
 def _height_width(image_size: int | Sequence[int]) -> tuple[int, int]:
-    if isinstance(image_size, int):
-        return image_size, image_size
-    height, width = image_size
-    return int(height), int(width)
+    sides = [image_size] * 2 if isinstance(image_size, int) else list(image_size)
+    if len(sides) != 2 or not all(isinstance(side, int) and side > 0 for side in sides):
+        raise ValueError(f"image_size must be one side or [height,width] in whole pixels, got {image_size!r}")
+    return sides[0], sides[1]
