@@ -34,7 +34,8 @@ def padded_columns(height, width):
 @scalar_kernel
 def face_is_drawn(corners, cull_backfaces):
     """False for degenerate, non-finite or culled faces and those with a corner at or behind the camera."""
-    if not min(corners[0, 2], min(corners[1, 2], corners[2, 2])) >= DEPTH_EPS:
+    # each for itself: the minimum of a number and NaN may be the number
+    if not (corners[0, 2] >= DEPTH_EPS and corners[1, 2] >= DEPTH_EPS and corners[2, 2] >= DEPTH_EPS):
         return False
     x0, y0, x1, y1, x2, y2 = (
         corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1], corners[2, 0], corners[2, 1],
