@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 import re
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ def job_folder(number: Any, overrides: str) -> str:
 
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
+_PIPED_WIDTH = 140  # columns of the table where no terminal says how many there are
 _running: list[Path] = []  # the sweep of this process, while it lasts
 
 
@@ -137,7 +139,7 @@ def _print_table(folder: Path, rows: list[Row]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH)
     columns, lines = _cells(rows)
     best = rows[0]["optimized_metric"] if rows else None
     table = Table(title=f"{len(rows)} runs" + (f", best {best} first" if best else ""))
