@@ -8,8 +8,8 @@ from __future__ import annotations
 import csv
 import json
 import math
-import sys
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
