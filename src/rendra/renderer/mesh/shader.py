@@ -96,10 +96,7 @@ class HardPhongShader(ShaderBase):
             ValueError: no cameras, or meshes without textures.
         """
         scene = self._scene(kwargs)
-
-        def color(seen: Fragments) -> Tensor:
-            return phong_shading(meshes, seen, texels=meshes.sample_textures(seen), **scene)
-
+        color = _textured(phong_shading, meshes, scene)
         return _nearest_face_image(fragments, color, self._blending(kwargs))
 
 
@@ -113,10 +110,7 @@ class SoftPhongShader(ShaderBase):
             ValueError: no cameras, or meshes without textures.
         """
         scene = self._scene(kwargs)
-
-        def color(seen: Fragments) -> Tensor:
-            return phong_shading(meshes, seen, texels=meshes.sample_textures(seen), **scene)
-
+        color = _textured(phong_shading, meshes, scene)
         return _softmax_image(fragments, color, self._blending(kwargs), *_planes(scene["cameras"], kwargs))
 
 
@@ -169,10 +163,7 @@ class HardFlatShader(ShaderBase):
             ValueError: no cameras, or meshes without textures.
         """
         scene = self._scene(kwargs)
-
-        def color(seen: Fragments) -> Tensor:
-            return flat_shading(meshes, seen, texels=meshes.sample_textures(seen), **scene)
-
+        color = _textured(flat_shading, meshes, scene)
         return _nearest_face_image(fragments, color, self._blending(kwargs))
 
 
@@ -282,6 +273,11 @@ def _planes(cameras: Any, kwargs: dict[str, Any]) -> tuple[float | Tensor, float
         kwargs.get("znear", getattr(cameras, "znear", 1.0)),
         kwargs.get("zfar", getattr(cameras, "zfar", 100.0)),
     )
+
+
+def _textured(shading: Callable[..., Tensor], meshes: Meshes, scene: dict[str, Any]) -> Callable[[Fragments], Tensor]:
+    """The colours of fragments: their texels, lit by `shading`."""
+    return lambda seen: shading(meshes, seen, texels=meshes.sample_textures(seen), **scene)
 
 
 def _nearest_face_image(
