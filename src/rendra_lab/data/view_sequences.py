@@ -67,7 +67,12 @@ class RenderedSequence(LightningDataModule):
         self.R, self.T = look_at_view_transform(distances, elevations, azimuths)
 
     def setup(self, stage: str) -> None:
-        """Lightning's hook: renders the views; UserError where one shows nothing."""
+        """Lightning's hook, before the fit and again before the test: renders the views, once.
+
+        UserError where one shows nothing.
+        """
+        if hasattr(self, "views"):
+            return
         views = render_views(self.scene, self.R, self.T)
         check_visible(views.silhouette, self.scene, "a frame of the sequence (data.distance)")
         self.views = [views.select(i) for i in range(len(self.R))]

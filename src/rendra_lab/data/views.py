@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,7 +95,7 @@ def _whereabouts(scene: MeshView) -> str:
     )
 
 
-class SingleView(LightningDataModule):
+class SingleView(LightningDataModule, ABC):
     """One view, again and again; subclasses say where it comes from.
 
     Args:
@@ -108,6 +109,15 @@ class SingleView(LightningDataModule):
         super().__init__()
         self.scene = scene
         self.steps = steps
+
+    @abstractmethod
+    def observe(self) -> ViewBatch:
+        """The view, a batch of one."""
+
+    def setup(self, stage: str) -> None:
+        """Lightning's hook, before the fit and again before the test: makes the view, once."""
+        if not hasattr(self, "target"):
+            self.target = self.observe()
 
     def train_dataloader(self) -> Repeated[ViewBatch]:
         """The view, `steps` times."""
@@ -141,10 +151,11 @@ class RenderedView(SingleView):
         self.R, self.T = look_at_view_transform(distance, elevation_deg, azimuth_deg)
         self._view = f"the target, seen from a distance of {distance:g} (data.distance)"
 
-    def setup(self, stage: str) -> None:
-        """Lightning's hook: renders the view; UserError where it shows nothing."""
-        self.target = render_views(self.scene, self.R, self.T)
-        check_visible(self.target.silhouette, self.scene, self._view)
+    def observe(self) -> ViewBatch:
+        """The view, rendered; UserError where it shows nothing."""
+        target = render_views(self.scene, self.R, self.T)
+        check_visible(target.silhouette, self.scene, self._view)
+        return target
 
 
 class PhotoView(SingleView):
@@ -169,13 +180,13 @@ class PhotoView(SingleView):
         super().__init__(scene, steps)
         self.photo, self.mask = read_photo(image, mask)
 
-    def setup(self, stage: str) -> None:
-        """Lightning's hook: fits the photograph into the scene's image size."""
+    def observe(self) -> ViewBatch:
+        """The photograph, fitted into the scene's image size."""
         background = torch.tensor(self.scene.background)
         rgb = self.photo * self.mask[..., None] + background * (1 - self.mask[..., None])
         rgba = _fit_into(torch.cat([rgb, self.mask[..., None]], dim=-1), self.scene.image_size)
         rgb = rgba[..., :3] + background * (1 - rgba[..., 4:])  # outside the photograph
-        self.target = ViewBatch(
+        return ViewBatch(
             rgb[None],
             rgba[None, ..., 3],
             torch.full((1, 3, 3), torch.nan),

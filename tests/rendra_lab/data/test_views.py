@@ -136,3 +136,12 @@ def test_a_mask_of_zeros_and_ones_is_told_its_range(tmp_path):
     Image.fromarray(np.ones((4, 4), np.uint8)).save(tmp_path / "mask.png")
     with pytest.raises(UserError, match="brightest pixel is 1 of 255"):
         read_photo(tmp_path / "mask.png", tmp_path / "mask.png")
+
+
+@pytest.mark.parametrize("make", [RenderedView, lambda scene: RenderedSequence(scene, frames=2)])
+def test_views_are_rendered_once_for_fit_and_test(scene, make):
+    data = make(scene)
+    data.setup("fit")
+    first = data.target
+    data.setup("test")
+    assert data.target is first
