@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra.structures.mesh_input import normals_for, rows_from_lists, rows_from_padded
-from rendra.structures.ragged import Ragged, batch_indices, lasting
+from rendra.structures.ragged import Ragged, batch_indices, consecutive_parts, each_repeated, lasting
 from rendra.structures.topology import Topology
 
 _NORMAL_EPS = 1e-6  # shorter vectors are divided by this instead of by their length
@@ -117,6 +117,11 @@ class Meshes:
     def valid(self) -> Tensor:
         """Which meshes have a face. (N,) bool"""
         return self._topology.valid
+
+    @property
+    def topology(self) -> Topology:
+        """What does not depend on where the vertices are; shared by all meshes that differ only in that."""
+        return self._topology
 
     @property
     def textures(self) -> Any:
@@ -255,7 +260,7 @@ class Meshes:
 
     # -- areas and normals
 
-    def _faces_cross(self) -> Tensor:
+    def faces_cross_packed(self) -> Tensor:
         """(v1 - v0) x (v2 - v0): along the normal, twice the area long. (sum F, 3)"""
 
         def cross() -> Tensor:
@@ -267,11 +272,11 @@ class Meshes:
 
     def faces_areas_packed(self) -> Tensor:
         """Area of each face, in squared units of the vertices. (sum F,)"""
-        return self._derive("areas", lambda: 0.5 * torch.linalg.vector_norm(self._faces_cross(), dim=1))
+        return self._derive("areas", lambda: 0.5 * torch.linalg.vector_norm(self.faces_cross_packed(), dim=1))
 
     def _faces_normals(self) -> Ragged:
         def normals() -> Ragged:
-            unit = F.normalize(self._faces_cross(), eps=_NORMAL_EPS, dim=1)
+            unit = F.normalize(self.faces_cross_packed(), eps=_NORMAL_EPS, dim=1)
             return Ragged(self._topology.faces.lengths, packed=unit)
 
         return self._derive("faces_normals", normals)
@@ -297,7 +302,7 @@ class Meshes:
             return self._normals
 
         def normals() -> Ragged:
-            cross, verts = self._faces_cross(), self.verts_packed()
+            cross, verts = self.faces_cross_packed(), self.verts_packed()
             summed = torch.zeros_like(verts)
             for corner in self.faces_packed().unbind(1):
                 summed = summed.index_add(0, corner, cross)
@@ -319,12 +324,7 @@ class Meshes:
 
     def get_bounding_boxes(self) -> Tensor:
         """Smallest and largest coordinates of each mesh; (inf, -inf) without vertices. (N, 3, 2)"""
-        verts = self.verts_packed()
-        owner = self.verts_packed_to_mesh_idx()[:, None].expand_as(verts)
-        empty = verts.new_full((len(self), 3), torch.inf)
-        low = empty.scatter_reduce(0, owner, verts, "amin")
-        high = (-empty).scatter_reduce(0, owner, verts, "amax")
-        return torch.stack([low, high], dim=2)
+        return self._verts.bounds()
 
     # -- copies
 
@@ -402,12 +402,7 @@ class Meshes:
         Raises:
             ValueError: another shape.
         """
-        if isinstance(scale, Tensor) and scale.numel() != 1:
-            if scale.shape != (len(self),):
-                raise ValueError(f"scale must be a number or have shape ({len(self)},), got {tuple(scale.shape)}")
-            scale = scale[self.verts_packed_to_mesh_idx(), None]
-        scaled = Ragged(self._topology.verts, packed=self.verts_packed() * scale)
-        return self._replaced(scaled, None, self._normals, self.textures)
+        return self._replaced(self._verts.scaled(scale), None, self._normals, self.textures)
 
     def update_padded(self, new_verts_padded: Tensor) -> "Meshes":
         """
@@ -425,11 +420,8 @@ class Meshes:
                 f"new values must have the same batch dimension and number of vertices, {expected}; got "
                 f" {tuple(new_verts_padded.shape)}"
             )
-        lengths = self._topology.verts
-        if lengths.dense:
-            return self._replaced(Ragged(lengths, padded=new_verts_padded), textures=self.textures)
-        rows = new_verts_padded.flatten(0, 1).index_select(0, lengths.padded_idx)
-        return self._replaced(Ragged(lengths, packed=rows), textures=self.textures)
+        verts = Ragged.from_padded(self._topology.verts, new_verts_padded)
+        return self._replaced(verts, textures=self.textures)
 
     # -- other batches of the same meshes
 
@@ -440,9 +432,7 @@ class Meshes:
         Raises:
             ValueError: N is not a positive integer.
         """
-        if not isinstance(N, int) or N <= 0:
-            raise ValueError(f"N must be an integer > 0, got {N!r}")
-        repeated = [i for i in range(len(self)) for _ in range(N)]
+        repeated = each_repeated(len(self), N)
         normals = None if self._normals is None else self._normals.select(repeated)
         textures = None if self.textures is None else self.textures.extend(N)
         return self._replaced(self._verts.select(repeated), self._topology.extended(N), normals, textures)
@@ -454,12 +444,7 @@ class Meshes:
         Raises:
             ValueError: `split_sizes` is not a list of integers that sum to N.
         """
-        if not all(isinstance(size, int) and size >= 0 for size in split_sizes):
-            raise ValueError(f"Value of split_sizes must be a list of integers, got {split_sizes}")
-        if sum(split_sizes) != len(self):
-            raise ValueError(f"split_sizes must sum to the {len(self)} meshes of the batch, got {split_sizes}")
-        starts = [sum(split_sizes[:i]) for i in range(len(split_sizes))]
-        return [self[start : start + size] for start, size in zip(starts, split_sizes, strict=True)]
+        return [self[part] for part in consecutive_parts(split_sizes, len(self), "meshes")]
 
     def submeshes(self, face_indices: Sequence[Sequence[Tensor]]) -> "Meshes":
         """

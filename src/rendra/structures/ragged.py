@@ -1,4 +1,4 @@
-"""A batch of rows of which every item has its own number: the storage behind meshes and textures."""
+"""A batch of rows of which every item has its own number: the storage behind meshes, clouds and textures."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -112,6 +112,14 @@ class Ragged:
             return cls(lengths, items=list(items), pad_value=pad_value)
         return cls(lengths, packed=like.new_zeros((0, *like.shape[1:])), pad_value=pad_value)
 
+    @classmethod
+    def from_padded(cls, lengths: Lengths, padded: Tensor, pad_value: float = 0) -> "Ragged":
+        """Take (N, padded_size, ...), whose padding may hold anything."""
+        if lengths.dense:
+            return cls(lengths, padded=padded, pad_value=pad_value)
+        rows = padded.flatten(0, 1).index_select(0, lengths.padded_idx)
+        return cls(lengths, packed=rows, pad_value=pad_value)
+
     def __len__(self) -> int:
         return len(self.lengths)
 
@@ -184,6 +192,28 @@ class Ragged:
         padded = fn(self._padded)
         return Ragged(self.lengths.to(padded.device), padded=padded, pad_value=self.pad_value)
 
+    def scaled(self, scale: float | Tensor) -> "Ragged":
+        """
+        The rows times a number, or times one for each item (N,).
+
+        Raises:
+            ValueError: another shape.
+        """
+        if isinstance(scale, Tensor) and scale.numel() != 1:
+            if scale.shape != (len(self),):
+                raise ValueError(f"scale must be a number or have shape ({len(self)},), got {tuple(scale.shape)}")
+            scale = scale[self.lengths.item_idx, None]
+        return Ragged(self.lengths, packed=self.packed() * scale, pad_value=self.pad_value)
+
+    def bounds(self) -> Tensor:
+        """Smallest and largest entry of each item's rows (M_i, C); (inf, -inf) without rows. (N, C, 2)"""
+        rows = self.packed()
+        owner = self.lengths.item_idx[:, None].expand_as(rows)
+        empty = rows.new_full((len(self), rows.shape[1]), torch.inf)
+        low = empty.scatter_reduce(0, owner, rows, "amin")
+        high = (-empty).scatter_reduce(0, owner, rows, "amax")
+        return torch.stack([low, high], dim=2)
+
 
 def batch_indices(index: Any, size: int) -> list[int]:
     """
@@ -213,3 +243,30 @@ def batch_indices(index: Any, size: int) -> list[int]:
         if not -size <= i < size:
             raise IndexError(f"index {i} is out of range for a batch of {size}")
     return [int(i) % size for i in picked]
+
+
+def consecutive_parts(split_sizes: list[int], size: int, items: str) -> list[slice]:
+    """
+    Where consecutive parts of the given sizes lie in a batch of `size` items.
+
+    Raises:
+        ValueError: `split_sizes` is not a list of integers that sum to `size`; the message calls them `items`.
+    """
+    if not all(isinstance(part, int) and part >= 0 for part in split_sizes):
+        raise ValueError(f"Value of split_sizes must be a list of integers, got {split_sizes}")
+    if sum(split_sizes) != size:
+        raise ValueError(f"split_sizes must sum to the {size} {items} of the batch, got {split_sizes}")
+    ends = list(accumulate(split_sizes))
+    return [slice(end - part, end) for end, part in zip(ends, split_sizes, strict=True)]
+
+
+def each_repeated(size: int, N: int) -> list[int]:
+    """
+    Every index of a batch N times in a row.
+
+    Raises:
+        ValueError: N is not a positive integer.
+    """
+    if not isinstance(N, int) or N <= 0:
+        raise ValueError(f"N must be an integer > 0, got {N!r}")
+    return [i for i in range(size) for _ in range(N)]
