@@ -1,7 +1,8 @@
 """Losses on meshes and point clouds."""
 
+from rendra.loss.chamfer import chamfer_distance
 from rendra.loss.mesh_edge_loss import mesh_edge_loss
 from rendra.loss.mesh_laplacian_smoothing import mesh_laplacian_smoothing
 from rendra.loss.mesh_normal_consistency import mesh_normal_consistency
 
-__all__ = ["mesh_edge_loss", "mesh_laplacian_smoothing", "mesh_normal_consistency"]
+__all__ = ["chamfer_distance", "mesh_edge_loss", "mesh_laplacian_smoothing", "mesh_normal_consistency"]
