@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from rendra.loss.mesh_mean import mean_over_meshes, nothing
+from rendra.ops.laplacian_matrices import corner_cotangents
 from rendra.structures.meshes import Meshes
 
-_SQUARED_AREA_EPS = 1e-12  # of a face; smaller ones are replaced by this
 _METHODS = ("uniform", "cot", "cotcurv")
 
 
@@ -69,11 +69,5 @@ def _cotangent(meshes: Meshes, curvature: bool) -> Tensor:
 def _edge_weights(meshes: Meshes) -> tuple[Tensor, Tensor]:
     """The weights w of all edges (E, 1), and the area of every face (sum F,)."""
     verts = meshes.verts_packed()
-    corners = verts.index_select(0, meshes.faces_packed().reshape(-1)).view(-1, 3, 3)
-    sides = corners.roll(-1, 1) - corners.roll(1, 1)  # side k lies opposite to corner k
-    squared_areas = 0.25 * torch.linalg.cross(sides[:, 1], sides[:, 2]).square().sum(1)
-    areas = squared_areas.clamp_min(_SQUARED_AREA_EPS).sqrt()
-    # the two sides at corner k, head to tail: their product is minus that of the vectors away from the corner
-    products = (sides.roll(-1, 1) * sides.roll(1, 1)).sum(2)
-    cotangents = -0.5 * products / areas[:, None]
-    return meshes.topology.corners_to_edges(verts.dtype) @ cotangents.reshape(-1, 1), areas
+    cotangents, areas = corner_cotangents(verts, meshes.faces_packed())
+    return meshes.topology.corners_to_edges(verts.dtype) @ cotangents.view(-1, 1), areas

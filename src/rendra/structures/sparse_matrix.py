@@ -19,7 +19,9 @@ class SparseMatrix:
     `torch.sparse` is twenty times slower here in its COO form, and warns of beta state in its CSR form.
     """
 
-    def __init__(self, rows: Tensor, columns: Tensor, entries: Tensor, shape: tuple[int, int]) -> None:
+    def __init__(
+        self, rows: Tensor, columns: Tensor, entries: Tensor, shape: tuple[int, int], symmetric: bool = False
+    ) -> None:
         """
         Take the entries in any order; those at the same place add up.
 
@@ -28,18 +30,24 @@ class SparseMatrix:
             columns: (K,) int64 in [0, C).
             entries: (K,) the numbers there; their type is the one of the products.
             shape: R and C.
+            symmetric: a promise that the matrix is its own transpose, which then need not be made.
         """
         order = torch.argsort(rows, stable=True)
         counts = torch.bincount(rows, minlength=shape[0])
         self.shape = shape
+        self._symmetric = symmetric
         self._columns = columns[order]
         self._entries = entries[order]
         self._ends = torch.cat([counts.new_zeros(1), counts.cumsum(0)])  # (R + 1,): where each row begins
 
-    @cached_property
-    @lasting()
+    @property
     def transposed(self) -> "SparseMatrix":
         """The matrix (C, R) with rows and columns exchanged."""
+        return self if self._symmetric else self._transposed
+
+    @cached_property
+    @lasting()
+    def _transposed(self) -> "SparseMatrix":
         rows = torch.arange(self.shape[0], device=self._ends.device)
         rows = rows.repeat_interleave(self._ends.diff(), output_size=len(self._columns))
         return SparseMatrix(self._columns, rows, self._entries, (self.shape[1], self.shape[0]))

@@ -168,7 +168,9 @@ class Topology:
 
     def corners_to_edges(self, dtype: torch.dtype) -> SparseMatrix:
         """Takes a number at each corner of all faces to the sum at the edge opposite to it. (E, 3 sum F)"""
-        return self._matrix("opposite", dtype, lambda: self._from_corners(self.faces_to_edges, len(self.edges), dtype))
+        return self._matrix(
+            "opposite", dtype, lambda: self._from_corners(self.faces_to_edges, len(self.edges), dtype)
+        )
 
     def corners_to_verts(self, dtype: torch.dtype) -> SparseMatrix:
         """Takes a number at each corner of all faces to the sum at its vertex. (sum V, 3 sum F)"""
