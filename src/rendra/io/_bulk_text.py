@@ -17,7 +17,7 @@ from rendra.io.errors import MeshFormatError
 Positions = npt.NDArray[np.int64]
 
 _NEWLINE, _SPACE, _HASH = 10, 32, 35
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 
 
 class Lines:
@@ -108,6 +108,7 @@ class Block:
         opening[1:] &= blank[:-1]
         self.begins: Positions = np.flatnonzero(opening)
         self.offsets: Positions = np.searchsorted(self.begins, bounds)
+        self._bounds = bounds
         self.counts = np.diff(self.offsets)
 
     def _joined(self, keyword_length: int) -> tuple[npt.NDArray[np.uint8], Positions]:
@@ -157,10 +158,17 @@ class Block:
 
     def blame(self, is_good: Callable[[bytes], object], expected: str) -> NoReturn:
         """Raise the error of the first token that is not good; called once it is known that one exists."""
-        tokens = enumerate(self.chars.tobytes().split())
+        nul = np.flatnonzero(self.chars == 0)
+        if len(nul):
+            row = np.searchsorted(self._bounds, nul[0], side="right") - 1
+            self.fail(int(row), "a NUL byte", "plain text")
+        tokens = enumerate(self.chars.tobytes().translate(_TIDY).split())
         bad = next((i for i, token in tokens if not is_good(token)), 0)
         found = self.token(bad).decode("utf-8", "replace")[:40]
         self.fail_token(bad, f"cannot read {found!r}", expected)
+
+
+_TIDY = bytes.maketrans(bytes(range(1, _SPACE)), b" " * (_SPACE - 1))
 
 
 def parse_numbers(text: bytes, dtype: type[np.generic]) -> npt.NDArray[Any] | None:
@@ -169,6 +177,12 @@ def parse_numbers(text: bytes, dtype: type[np.generic]) -> npt.NDArray[Any] | No
         return np.zeros(0, dtype=dtype)
     if b"\0" in text:
         return None
+    values = _parse_spaced(text, dtype)
+    return _parse_spaced(text.translate(_TIDY), dtype) if values is None else values
+
+
+def _parse_spaced(text: bytes, dtype: type[np.generic]) -> npt.NDArray[Any] | None:
+    """As `parse_numbers`; NumPy takes spaces and line ends for blanks, but no other control characters."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy before 2.4 only warned of unread text
         try:

@@ -18,6 +18,7 @@ Floats = npt.NDArray[np.float32]
 
 _OTHER, _VERTEX, _UV, _NORMAL, _FACE = range(5)
 _SLASH = ord("/")
+MOST_LIBRARIES = 1000  # each is looked for on disk
 _CORNER = re.compile(rb"[+-]?\d+(/([+-]?\d+)?){0,2}")
 _FORMS = "v, v/vt, v//vn or v/vt/vn, whole numbers counted from 1 or negative from the end"
 # fmt: off
@@ -42,7 +43,7 @@ class ObjData:
         faces, faces_uvs, faces_normals: (F, 3) indices into verts, uvs, normals; the last two -1 where absent.
         faces_materials: (F,) indices into material_names; -1 before the first usemtl.
         material_names: in the order of their first use.
-        libraries: (line, text) of every mtllib statement.
+        libraries: (line, text) of every mtllib statement, repetitions left out.
     """
 
     verts: Floats
@@ -258,14 +259,20 @@ def _read_names(
     first = lines.chars[lines.firsts[others]]
     names: dict[str, int] = {}
     uses: list[tuple[int, int]] = [(-1, -1)]  # row, material
-    libraries: list[tuple[int, str]] = []
+    libraries: dict[str, int] = {}
     for row in others[(first == ord("u")) | (first == ord("m"))].tolist():
         word, _, rest = lines.text(row).replace("\t", " ").partition(" ")
         if word == "usemtl" and rest.strip():
             uses.append((row, names.setdefault(rest.strip(), len(names))))
         elif word == "mtllib" and rest.strip():
-            libraries.append((lines.number(row), rest.strip()))
+            libraries.setdefault(rest.strip(), lines.number(row))
+            if len(libraries) > MOST_LIBRARIES:
+                lines.fail(row, "too many material libraries", f"at most {MOST_LIBRARIES:,}")
         elif word in ("usemtl", "mtllib"):
             lines.fail(row, f"{word} without a name")
     at, material = np.array(uses, dtype=np.int64).T
-    return material[np.searchsorted(at, face_rows) - 1], list(names), libraries
+    return (
+        material[np.searchsorted(at, face_rows) - 1],
+        list(names),
+        [(line, text) for text, line in libraries.items()],
+    )

@@ -5,6 +5,8 @@ Nothing is allocated before the file is known to be long enough for it.
 
 import struct
 import warnings
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -229,7 +231,7 @@ class _BinaryReader:
                 reader = struct.Struct(self._header.encoding + _STRUCT[each.length_kind])
                 steps.append((skip, reader.unpack_from, reader.size, _width(each.kind)))
                 skip = 0
-        rows, starts, lengths = [], [], []
+        rows, starts, lengths = array("q"), array("q"), array("q")
         data, position, end = self._source.data, self._position, len(self._source.data)
         try:
             for _ in range(element.count):
@@ -256,7 +258,7 @@ class _BinaryReader:
             np.array(lengths, dtype=np.int64).reshape(shape),
         )
 
-    def _fail_row(self, element: Element, row: int, last_length: list[int], cause: Exception) -> NoReturn:
+    def _fail_row(self, element: Element, row: int, last_length: Sequence[int], cause: Exception) -> NoReturn:
         found = f"a list of {last_length[0]}" if last_length else None
         raise MeshFormatError(
             f"{element.name} {row} of {element.count} has a negative length, or runs past the end of the file",

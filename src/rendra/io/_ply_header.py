@@ -12,6 +12,7 @@ _TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_MOST_COLUMNS = 10_000  # elements and properties together
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -67,6 +68,7 @@ class _HeaderReader:
         self._position = 0
         self._encoding: str | None = None
         self._elements: list[Element] = []
+        self._names: set[tuple[int, str]] = set()  # of elements behind 0, of properties behind their element's number
 
     def read(self) -> Header:
         """All lines up to end_header."""
@@ -110,9 +112,15 @@ class _HeaderReader:
     def _take_element(self, words: list[str]) -> None:
         if len(words) != 2 or re.fullmatch(r"[0-9]{1,18}", words[1]) is None:
             self._fail("bad element", "element <name> <number of rows>")
-        if any(element.name == words[0] for element in self._elements):
-            self._fail("an element is declared twice")
+        self._name(0, words[0], "an element is declared twice")
         self._elements.append(Element(words[0], int(words[1]), self._line, []))
+
+    def _name(self, owner: int, name: str, twice: str) -> None:
+        if (owner, name) in self._names:
+            self._fail(twice)
+        self._names.add((owner, name))
+        if len(self._names) > _MOST_COLUMNS:
+            self._fail("too many elements and properties", f"at most {_MOST_COLUMNS:,}")
 
     def _take_property(self, words: list[str]) -> None:
         if not self._elements:
@@ -126,8 +134,7 @@ class _HeaderReader:
                 self._fail("the length of a list is no integer", "property list <integer type> <type> <name>")
         else:
             self._fail("bad property", "property <type> <name>, or property list <type> <type> <name>")
-        if any(each.name == new.name for each in properties):
-            self._fail("a property is declared twice")
+        self._name(len(self._elements), new.name, "a property is declared twice")
         properties.append(new)
 
     def _demand_columns(self) -> None:

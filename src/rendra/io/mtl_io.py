@@ -163,31 +163,34 @@ def _name(rest: bytes, source: Source, line: int) -> str:
 
 def _texture_name(rest: bytes, source: Source, line: int) -> str:
     """The file name of a map statement, which may hold spaces, without the options before it."""
-    words = rest.split()
-    while words and words[0] in _MAP_OPTIONS:
-        option, taken = words[0], 1
-        while taken <= _MAP_OPTIONS[option] and len(words) > taken:
-            if option in _VECTOR_OPTIONS and not _is_number(words[taken]):
-                break
-            taken += 1
-        rest = rest.split(maxsplit=taken)[-1] if len(words) > taken else b""
-        words = rest.split()
-    if not rest:
+    words, at = list(re.finditer(rb"\S+", rest)), 0
+    while at < len(words) and words[at][0] in _MAP_OPTIONS:
+        option = words[at][0]
+        behind = min(at + 1 + _MAP_OPTIONS[option], len(words))
+        at += 1
+        while at < behind and (option not in _VECTOR_OPTIONS or _is_number(words[at][0])):
+            at += 1
+    if at == len(words):
         raise MeshFormatError("a texture map without a file name", source.name, line, expected="map_Kd <file>")
-    return rest.decode("utf-8", "replace")
+    return rest[words[at].start() :].decode("utf-8", "replace")
 
 
 def _is_number(word: bytes) -> bool:
-    return re.fullmatch(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", word) is not None
+    return re.fullmatch(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", word) is not None
 
 
 def _numbers(rest: bytes, counts: tuple[int, ...], source: Source, line: int) -> list[float]:
     words = rest.partition(b"#")[0].split()
     values = [float(word) for word in words if _is_number(word)]
-    if len(words) not in counts or len(values) != len(words) or not np.isfinite(values).all():
+    if len(words) not in counts or len(values) != len(words) or not _fit_single(values):
         expected = " or ".join(map(str, counts)) + (" finite number" if counts == (1,) else " finite numbers")
         raise MeshFormatError("bad material value", source.name, line, rest.decode("utf-8", "replace"), expected)
     return values
+
+
+def _fit_single(values: list[float]) -> bool:
+    """Whether all are finite in single precision."""
+    return all(abs(value) <= torch.finfo(torch.float32).max for value in values)
 
 
 def make_mesh_texture_atlas(

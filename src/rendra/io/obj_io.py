@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rendra.common.datatypes import Device
 from rendra.io._images import encode_image, image_suffix
-from rendra.io._obj_text import ObjData, parse_obj
+from rendra.io._obj_text import MOST_LIBRARIES, ObjData, parse_obj
 from rendra.io._rows import check_decimals, float_rows, format_rows, int_rows, number_format
 from rendra.io._source import (
     FileLike,
@@ -30,6 +30,7 @@ from rendra.io._source import (
     read_source,
     write_sink,
 )
+from rendra.io.errors import MeshFormatError
 from rendra.io.mtl_io import MaterialProperties, TextureImages, make_mesh_texture_atlas, read_materials
 from rendra.io.pluggable_formats import MeshFormatInterpreter, endswith, single_mesh
 from rendra.renderer.mesh.textures import TexturesAtlas, TexturesBase, TexturesUV, TexturesVertex
@@ -177,7 +178,12 @@ def _find_libraries(source: Source, line: int, written: str, options: _ReadOptio
         path_manager=options.path_manager,
         allow_outside=options.allow_outside,
     )
-    for names in ([written], written.split()):
+    words = written.split()
+    if len(words) > MOST_LIBRARIES:
+        raise MeshFormatError(
+            "too many material libraries", source.name, line, written, f"at most {MOST_LIBRARIES:,}"
+        )
+    for names in ([written], words):
         paths = [locate(name) for name in names]
         contents = [(path, read_neighbour(path, options.path_manager)) for path in paths]
         found = [Source(path, content, source.folder) for path, content in contents if content is not None]

@@ -5,14 +5,10 @@ import os
 import pickle
 import struct
 import tracemalloc
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from rendra.io import IO, MeshFormatError, load_obj, load_ply
@@ -314,58 +310,3 @@ def test_the_error_survives_a_worker_process():
     assert (copy.why, copy.file, copy.line, copy.found, copy.expected) == ("why", "f.obj", 3, "found" * 50, "more")
     assert "..." in str(error)
     assert "\\x1b" in str(MeshFormatError("why", found="\x1b[31m"))
-
-
-# Fuzzing: a result or a MeshFormatError, nothing else
-
-QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-
-number = st.one_of(
-    st.integers(-4, 9).map(str),
-    st.floats().map(repr),
-    st.sampled_from(["1/2", "1//1", "1/1/1", "-1", "/", "-", "1e400", "x", "\\\n", "#", "1/", "+2", "\t", "\0", "é"]),
-)
-obj_line = st.tuples(
-    st.sampled_from(["v", "vt", "vn", "f", "f", "usemtl", "g", "", "#", " v", "mtllib"]), st.lists(number, max_size=7)
-).map(lambda row: " ".join([row[0], *row[1]]))
-obj_text = st.lists(obj_line, max_size=12).map(lambda rows: (TRIANGLE + "\n".join(rows)).encode())
-
-ply_header = st.lists(
-    st.one_of(
-        st.sampled_from([XYZ, FACE, "property list char uint vertex_index\n", "property uchar red\n", "comment c\n"]),
-        st.tuples(st.sampled_from(["vertex", "face", "x"]), st.integers(0, 4)).map(
-            lambda e: f"element {e[0]} {e[1]}\n"
-        ),
-    ),
-    max_size=6,
-).map("".join)
-ply_file = st.tuples(
-    st.sampled_from(["ascii", "binary_little_endian", "binary_big_endian"]),
-    st.one_of(ply_header, st.just(f"element vertex 3\n{XYZ}element face 2\n{FACE}")),
-    st.one_of(st.binary(max_size=80), st.lists(number, max_size=20).map(lambda n: " ".join(n).encode())),
-).map(lambda f: f"ply\nformat {f[0]} 1.0\n{f[1]}end_header\n".encode() + f[2])
-
-
-def survives(load: Callable, data: bytes) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            verts, faces = load(io.BytesIO(data))[:2]
-        except MeshFormatError:
-            return
-    indices = getattr(faces, "verts_idx", faces)
-    assert torch.isfinite(verts).all()
-    assert indices.shape[1] == 3
-    assert not len(indices) or 0 <= indices.min() <= indices.max() < len(verts)
-
-
-@QUICK
-@given(st.one_of(obj_text, st.binary(max_size=200)))
-def test_fuzzed_obj(data):
-    survives(load_obj, data)
-
-
-@QUICK
-@given(st.one_of(ply_file, st.binary(max_size=200).map(lambda b: b"ply\n" + b)))
-def test_fuzzed_ply(data):
-    survives(load_ply, data)

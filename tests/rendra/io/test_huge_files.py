@@ -1,0 +1,144 @@
+"""Files of a few megabytes that would take hours or gigabytes if any step were worse than linear."""
+
+import io
+import struct
+
+import numpy as np
+import pytest
+from file_limits import within_limits
+from PIL import Image
+from small_files import image_bytes
+
+from rendra.io import MeshFormatError, load_obj, load_ply
+from rendra.io._images import decode_image
+from rendra.io.mtl_io import load_mtl
+
+M = 1_000_000
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY = "ply\nformat ascii 1.0\n"
+BINARY_PLY = "ply\nformat binary_little_endian 1.0\n"
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+
+OBJ_TEXTS = {
+    "a number that is none": ("v 0 0 " + "9" * 2 * M + "x\n", "cannot read '9999"),
+    "a number of ten megabytes": ("v 0 0 0." + "9" * 10 * M + "\n", None),
+    "a number beyond all bounds": ("v 0 0 " + "9" * 10 * M + "\n", "not finite"),
+    "a comment of ten megabytes": (TRIANGLE + "#" + "x" * 10 * M + "\nf 1 2 3\n", None),
+    "a word of ten megabytes": ("x" * 10 * M, "unknown to OBJ"),
+    "a line of blanks": (TRIANGLE + "v 0 0 0 " + " " * 10 * M, None),
+    "a polygon of a million corners": (TRIANGLE + "f " + "1 2 3 " * (M // 3) + "\n", None),
+    "a vertex of two million numbers": ("v " + "1 " * 2 * M + "\n", "a vertex cannot have 2000000 numbers"),
+    "an index of ten megabytes": (TRIANGLE + "f 1 2 " + "3" * 10 * M + "\n", "names vertex 3333"),
+    "an index of signs": (TRIANGLE + "f 1 2 " + "-" * 2 * M + "\n", "cannot read '-----"),
+    "a corner of slashes": (TRIANGLE + "f 1 2 " + "3/" * 2 * M + "\n", "more than three indices"),
+    "one line, continued": (TRIANGLE + "f 1 2 3 " + "\\\n" * (M // 2) + "\n", None),
+    "blank lines": ("\n" * 5 * M, None),
+    "indented lines": ("  v 0 0 0\n" * (M // 5), None),
+    "as many materials as lines": (TRIANGLE + "".join(f"usemtl {i}\n" for i in range(M // 5)), None),
+    "one library, again and again": (TRIANGLE + "usemtl a\n" + "mtllib lost.mtl\n" * (M // 5), None),
+    "libraries without end": (
+        TRIANGLE + "usemtl a\n" + "".join(f"mtllib {i}\n" for i in range(M // 5)), "too many material libraries",
+    ),
+    "libraries on one line": (
+        TRIANGLE + "usemtl a\nmtllib " + " ".join(map(str, range(M))) + "\n", "too many material libraries",
+    ),
+}  # fmt: skip
+MTL_TEXTS = {
+    "a number that is none": ("newmtl a\nNs " + "9" * 2 * M + "x\n", "bad material value"),
+    "a number of ten megabytes": ("newmtl a\nNs 0." + "9" * 10 * M + "\n", None),
+    "options without end": ("newmtl a\nmap_Kd " + "-bm 1 " * (M // 5) + "lost.png\n", None),
+    "a name of ten megabytes": ("newmtl a\nmap_Kd " + "x" * 10 * M + "\n", None),
+    "materials without end": ("".join(f"newmtl {i}\nKd 1\n" for i in range(M // 20)), None),
+}
+PLY_TEXTS = {
+    "a number that is none": (f"{PLY}element vertex 1\n{XYZ}end_header\n0 0 {'9' * 2 * M}x\n", "cannot read '9999"),
+    "properties without end": (
+        f"{PLY}element vertex 0\n" + "".join(f"property char {i}\n" for i in range(M // 5)), "too many",
+    ),
+    "elements without end": (PLY + "".join(f"element {i} 0\n" for i in range(M // 5)), "too many"),
+    "a comment of ten megabytes": (f"{PLY}comment {'x' * 10 * M}\nelement vertex 0\n{XYZ}end_header\n", None),
+    "a statement of ten megabytes": (f"{PLY}{'x' * 10 * M}\n", "unknown header statement"),
+    "comments without end": (f"{PLY}{'comment' + chr(10) * (M // 5)}end_header\n", "no vertex element"),
+    "rows of one byte": (
+        f"{BINARY_PLY}element vertex 0\n{XYZ}element x {M}\nproperty list char char y\nend_header\n"
+        + "\0" * (M - 1) + "\1\0", None,
+    ),
+    "a list of every length": (
+        f"{BINARY_PLY}element vertex 0\n{XYZ}element x 2\nproperty list uint char y\nend_header\n"
+        + "\0\0\0\0" + struct.pack("<I", 2**31 - 1).decode("latin-1") + "x" * 1000, "a list of 2147483647",
+    ),
+}  # fmt: skip
+
+
+def judge(load, text: str, message: str | None) -> None:
+    source = io.BytesIO(text.encode("latin-1"))
+    with within_limits():
+        if message is None:
+            load(source)
+            return
+        with pytest.raises(MeshFormatError) as caught:
+            load(source)
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("name", OBJ_TEXTS)
+def test_huge_obj(name):
+    judge(load_obj, *OBJ_TEXTS[name])
+
+
+@pytest.mark.parametrize("name", MTL_TEXTS)
+def test_huge_mtl(name, tmp_path):
+    judge(lambda source: load_mtl(source, material_names=["a"], data_dir=str(tmp_path)), *MTL_TEXTS[name])
+
+
+@pytest.mark.parametrize("name", PLY_TEXTS)
+def test_huge_ply(name):
+    judge(load_ply, *PLY_TEXTS[name])
+
+
+# Images that are small on disk and large in memory
+
+BOMB = (12_000, 9_000)  # below the limit of Pillow, above ours
+
+
+def claimed(kind: str) -> bytes:
+    """An image file that claims the size of BOMB and holds a few pixels."""
+    data, size = bytearray(image_bytes(kind, (4, 2))), BOMB
+    if kind == "BMP":
+        struct.pack_into("<ii", data, 18, *size)
+    elif kind == "TGA":
+        struct.pack_into("<HH", data, 12, *size)
+    elif kind == "GIF":
+        struct.pack_into("<HH", data, 6, *size)
+    elif kind == "PPM":
+        return bytes(data).replace(b"4 2", b"%d %d" % size)
+    elif kind == "JPEG":
+        at = data.index(b"\xff\xc0") + 5
+        struct.pack_into(">HH", data, at, *size)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["BMP", "TGA", "GIF", "PPM", "JPEG"])
+def test_images_that_claim_too_much(kind):
+    with within_limits(), pytest.raises(MeshFormatError, match=r"^bomb: the image is too large.*at most 67,108,864"):
+        decode_image(claimed(kind), "bomb")
+
+
+def test_a_bomb_that_keeps_its_promise():
+    buffer = io.BytesIO()
+    Image.new("1", BOMB).save(buffer, "PNG")
+    assert len(buffer.getvalue()) < 100_000
+    with within_limits(), pytest.raises(MeshFormatError, match="found '12000 x 9000'"):
+        decode_image(buffer.getvalue(), "bomb")
+
+
+def test_text_that_unpacks_to_gigabytes_is_not_unpacked():
+    from PIL import PngImagePlugin
+
+    info = PngImagePlugin.PngInfo()
+    info.add_text("comment", "x" * 60 * M, zip=True)
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((2, 2, 3), dtype=np.uint8)).save(buffer, "PNG", pnginfo=info)
+    with within_limits(), pytest.raises(MeshFormatError, match="cannot decode the image"):
+        decode_image(buffer.getvalue(), "bomb")
