@@ -29,5 +29,6 @@ def mesh_normal_consistency(meshes: Meshes) -> Tensor:
     normals = cross * torch.where(flat, 1.0, squared).rsqrt().masked_fill(flat, 0.0)
     # 1 - cos as half of |n0 - n1|^2, which keeps its digits at small angles
     errors = 0.5 * (topology.normal_differences(cross.dtype) @ normals).square().sum(1)
-    missing = 0.5 * flat[:, 0].to(cross.dtype)[topology.face_pairs].sum(1)  # a normal 0 takes its half of the square
+    # a normal that is 0 took its half of the square away
+    missing = 0.5 * flat.index_select(0, topology.face_pairs.view(-1)).view(-1, 2).sum(1)
     return mean_over_meshes(errors + missing, topology.face_pairs_to_mesh, len(meshes))

@@ -1,28 +1,51 @@
 """Operators on meshes, point clouds and grids."""
 
 from rendra.ops.ball_query import ball_query
-from rendra.ops.graph_conv import GraphConv, gather_scatter
+from rendra.ops.graph_conv import GraphConv
 from rendra.ops.interp_face_attrs import interpolate_face_attributes
 from rendra.ops.knn import knn_gather, knn_points
 from rendra.ops.laplacian_matrices import cot_laplacian, laplacian, norm_laplacian
 from rendra.ops.mesh_face_areas_normals import mesh_face_areas_normals
 from rendra.ops.mesh_filtering import taubin_smoothing
+from rendra.ops.packed_to_padded import packed_to_padded, padded_to_packed
+from rendra.ops.perspective_n_points import efficient_pnp
+from rendra.ops.points_alignment import corresponding_points_alignment, iterative_closest_point
+from rendra.ops.points_normals import estimate_pointcloud_local_coord_frames, estimate_pointcloud_normals
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
 from rendra.ops.subdivide_meshes import SubdivideMeshes
+from rendra.ops.utils import (
+    convert_pointclouds_to_tensor,
+    eyes,
+    get_point_covariances,
+    is_pointclouds,
+    wmean,
+)
 from rendra.ops.vert_align import vert_align
 
 __all__ = [
     "GraphConv",
     "SubdivideMeshes",
     "ball_query",
+    "convert_pointclouds_to_tensor",
+    "corresponding_points_alignment",
     "cot_laplacian",
+    "efficient_pnp",
+    "estimate_pointcloud_local_coord_frames",
+    "estimate_pointcloud_normals",
+    "eyes",
+    "get_point_covariances",
     "interpolate_face_attributes",
+    "is_pointclouds",
+    "iterative_closest_point",
     "knn_gather",
     "knn_points",
     "laplacian",
     "mesh_face_areas_normals",
     "norm_laplacian",
+    "packed_to_padded",
+    "padded_to_packed",
     "sample_points_from_meshes",
     "taubin_smoothing",
     "vert_align",
+    "wmean",
 ]
