@@ -33,7 +33,7 @@ def vert_align(
         ValueError: `verts` is something else, a shape is not as above, or the batches differ in N.
     """
     positions, rows = _positions(verts)
-    maps = list(feats) if isinstance(feats, (list, tuple)) else [feats]
+    maps: list[Any] = list(feats) if isinstance(feats, (list, tuple)) else [feats]
     if not maps:
         raise ValueError("feats must hold at least one map, got an empty list")
     grid = positions[:, None, :, :2]  # (N, 1, V, 2)
