@@ -46,6 +46,7 @@ NAMES = {
     "rendra.ops.sample_points_from_meshes": "sample_points_from_meshes",
     "rendra.ops.subdivide_meshes": "SubdivideMeshes",
     "rendra.ops.vert_align": "vert_align",
+    "rendra.loss": "chamfer_distance mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency",
     "rendra.loss.mesh_edge_loss": "mesh_edge_loss",
     "rendra.loss.mesh_laplacian_smoothing": "mesh_laplacian_smoothing",
     "rendra.loss.mesh_normal_consistency": "mesh_normal_consistency",
