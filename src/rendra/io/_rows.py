@@ -32,6 +32,22 @@ def float_rows(values: Tensor, width: int, name: str, count: str) -> np.ndarray:
     return table
 
 
+def single_rows(values: Tensor, width: int, name: str, count: str) -> np.ndarray:
+    """(n, width) float32, contiguous, of a tensor that has that shape or is empty.
+
+    Raises:
+        ValueError: another shape, or a number that is not finite in single precision.
+    """
+    table = float_rows(values, width, name, count)
+    with np.errstate(over="ignore"):
+        single = np.ascontiguousarray(table, dtype=np.float32)
+    bad = ~np.isfinite(single).all(axis=1)
+    if bad.any():
+        row = int(bad.argmax())
+        raise ValueError(f"'{name}' is not finite in single precision in row {row}: {table[row].tolist()}")
+    return single
+
+
 def int_rows(values: Tensor, limit: int, name: str, count: str) -> np.ndarray:
     """(n, 3) int64 of a tensor of indices that has that shape or is empty.
 

@@ -97,7 +97,7 @@ def neighbour(
     name: str,
     *,
     file: str,
-    line: int,
+    line: int | None,
     path_manager: PathManager | None = None,
     allow_outside: bool = False,
 ) -> str:
@@ -109,7 +109,7 @@ def neighbour(
     Args:
         folder: folder of the file that names.
         name: the name as written; Windows separators are understood.
-        file, line: where it is written, for the error.
+        file, line: where it is written, for the error; no line where lines mean nothing.
         path_manager: interprets the paths where given.
         allow_outside: accept absolute paths and paths that climb out of the folder.
 

@@ -4,11 +4,16 @@ from collections import deque
 from typing import Any
 
 from rendra.common.datatypes import Device
+from rendra.io._mesh_as_cloud import MeshFileAsCloud
 from rendra.io._source import FileLike, PathManager
+from rendra.io.experimental_gltf_io import MeshGlbFormat
 from rendra.io.obj_io import MeshObjFormat
+from rendra.io.off_io import MeshOffFormat
 from rendra.io.pluggable_formats import MeshFormatInterpreter, PointcloudFormatInterpreter
-from rendra.io.ply_io import MeshPlyFormat
-from rendra.structures import Meshes
+from rendra.io.ply_io import MeshPlyFormat, PointcloudPlyFormat
+from rendra.io.stl_io import MeshStlFormat
+from rendra.io.xyz_io import PointcloudXyzFormat
+from rendra.structures import Meshes, Pointclouds
 
 
 class IO:
@@ -17,7 +22,8 @@ class IO:
     The format registered last is asked first.
 
     Args:
-        include_default_formats: register OBJ and PLY.
+        include_default_formats: register OBJ, OFF, PLY, STL and glTF for meshes; PLY, XYZ, and the vertices of OBJ,
+            OFF and glTF, for clouds.
         path_manager: interprets all paths, as `iopath.common.file_io.PathManager` does; None for plain files.
 
     Attributes:
@@ -34,8 +40,16 @@ class IO:
 
     def register_default_formats(self) -> None:
         """Register the formats that come with this package."""
-        self.register_meshes_format(MeshObjFormat())
-        self.register_meshes_format(MeshPlyFormat())
+        for mesh_format in (MeshGlbFormat(), MeshStlFormat(), MeshOffFormat(), MeshObjFormat(), MeshPlyFormat()):
+            self.register_meshes_format(mesh_format)
+        for cloud_format in (
+            MeshFileAsCloud(MeshGlbFormat(), (".glb", ".gltf")),
+            MeshFileAsCloud(MeshOffFormat(), (".off",)),
+            MeshFileAsCloud(MeshObjFormat(), (".obj",)),
+            PointcloudXyzFormat(),
+            PointcloudPlyFormat(),
+        ):
+            self.register_pointcloud_format(cloud_format)
 
     def register_meshes_format(self, interpreter: MeshFormatInterpreter) -> None:
         """Add a mesh format, to be asked before all others.
@@ -118,11 +132,20 @@ class IO:
                 return
         raise ValueError(f"No mesh interpreter found to write to {path}.{_known(self.mesh_interpreters)}")
 
-    def load_pointcloud(self, path: FileLike, device: Device = "cpu", **kwargs: Any) -> Any:
-        """Read a point cloud file into a batch of one.
+    def load_pointcloud(self, path: FileLike, device: Device = "cpu", **kwargs: Any) -> Pointclouds:
+        """Read a point cloud file, or the vertices of a mesh file, into a batch of one.
+
+        Args:
+            path: its suffix chooses the format.
+            device: where the tensors go.
+            kwargs: options of the format, such as `columns` for XYZ.
+
+        Returns:
+            The points, with normals where the file has them, and with its colours in [0, 1] as features.
 
         Raises:
             ValueError: no registered format reads this file.
+            MeshFormatError: the file is malformed.
         """
         for interpreter in self.pointcloud_interpreters:
             cloud = interpreter.read(path, device=device, path_manager=self.path_manager, **kwargs)
@@ -130,12 +153,20 @@ class IO:
                 return cloud
         raise ValueError(f"No point cloud interpreter found to read {path}.{_known(self.pointcloud_interpreters)}")
 
-    def save_pointcloud(self, data: Any, path: FileLike, binary: bool | None = None, **kwargs: Any) -> None:
+    def save_pointcloud(self, data: Pointclouds, path: FileLike, binary: bool | None = None, **kwargs: Any) -> None:
         """Write a batch of one point cloud.
 
+        Args:
+            data: the cloud; features of three channels are written as colours.
+            path: its suffix chooses the format.
+            binary: binary or text, where the format has both; None for its own choice.
+            kwargs: options of the format, such as `decimal_places` or PLY's `colors_as_uint8`.
+
         Raises:
-            ValueError: no registered format writes this file.
+            ValueError: no registered format writes this file, or the batch has not exactly one cloud.
         """
+        if not isinstance(data, Pointclouds):
+            raise ValueError(f"save_pointcloud() expects a Pointclouds object, got {type(data).__name__}")
         for interpreter in self.pointcloud_interpreters:
             if interpreter.save(data, path, path_manager=self.path_manager, binary=binary, **kwargs):
                 return

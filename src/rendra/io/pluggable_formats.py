@@ -6,7 +6,7 @@ from typing import Any
 
 from rendra.common.datatypes import Device
 from rendra.io._source import FileLike, PathManager
-from rendra.structures import Meshes
+from rendra.structures import Meshes, Pointclouds
 
 
 def endswith(path: object, suffixes: Sequence[str]) -> bool:
@@ -51,12 +51,14 @@ class MeshFormatInterpreter:
 class PointcloudFormatInterpreter:
     """One point cloud format. Subclass it and hand an instance to `IO.register_pointcloud_format`."""
 
-    def read(self, path: FileLike, device: Device, path_manager: PathManager | None, **kwargs: Any) -> Any:
+    def read(
+        self, path: FileLike, device: Device, path_manager: PathManager | None, **kwargs: Any
+    ) -> Pointclouds | None:
         """Read a point cloud, or return None where `path` is not of this format; arguments as for meshes."""
         raise NotImplementedError
 
     def save(
-        self, data: Any, path: FileLike, path_manager: PathManager | None, binary: bool | None, **kwargs: Any
+        self, data: Pointclouds, path: FileLike, path_manager: PathManager | None, binary: bool | None, **kwargs: Any
     ) -> bool:
         """Write a point cloud and return True, or return False where `path` is not of this format."""
         raise NotImplementedError
@@ -72,5 +74,19 @@ def single_mesh(data: Meshes) -> Meshes:
         raise ValueError(
             f"a file holds one mesh, but the batch has {len(data)}: save data[i] one by one, "
             "or join them with join_meshes_as_scene"
+        )
+    return data
+
+
+def single_cloud(data: Pointclouds) -> Pointclouds:
+    """The batch itself, if it holds one cloud.
+
+    Raises:
+        ValueError: it holds none or several, which no file format here can.
+    """
+    if len(data) != 1:
+        raise ValueError(
+            f"a file holds one point cloud, but the batch has {len(data)}: save data[i] one by one, "
+            "or join them with join_pointclouds_as_scene"
         )
     return data

@@ -20,9 +20,15 @@ from rendra.io._ply_header import parse_header
 from rendra.io._rows import check_decimals, float_rows, format_rows, int_rows, number_format
 from rendra.io._source import FileLike, PathManager, Source, read_source, write_sink
 from rendra.io.errors import MeshFormatError
-from rendra.io.pluggable_formats import MeshFormatInterpreter, endswith, single_mesh
+from rendra.io.pluggable_formats import (
+    MeshFormatInterpreter,
+    PointcloudFormatInterpreter,
+    endswith,
+    single_cloud,
+    single_mesh,
+)
 from rendra.renderer.mesh.textures import TexturesAtlas, TexturesBase, TexturesVertex
-from rendra.structures import Meshes
+from rendra.structures import Meshes, Pointclouds
 
 Floats = npt.NDArray[np.float32]
 
@@ -303,3 +309,62 @@ def _savable_colors(textures: TexturesBase | None) -> Tensor | None:
         f"Texture will not be saved: PLY files hold RGB vertex colours, not {type(textures).__name__}", stacklevel=5
     )
     return None
+
+
+class PointcloudPlyFormat(PointcloudFormatInterpreter):
+    """PLY files for `IO`, read and written as point clouds."""
+
+    def __init__(self) -> None:
+        self.known_suffixes = (".ply",)
+
+    def read(
+        self, path: FileLike, device: Device, path_manager: PathManager | None, **kwargs: Any
+    ) -> Pointclouds | None:
+        """Read the vertices, their normals, and their colours as features; None for any other suffix.
+
+        Faces are checked, but not kept.
+
+        Raises:
+            MeshFormatError: the file is malformed or shorter than its header says.
+            OSError: the path cannot be opened.
+        """
+        if not endswith(path, self.known_suffixes):
+            return None
+        data = parse_ply(read_source(path, path_manager))
+        points, normals, colors = (
+            None if each is None else [torch.from_numpy(each).to(device)]
+            for each in (data.verts, data.normals, data.verts_colors)
+        )
+        assert points is not None  # a file without vertices was refused
+        return Pointclouds(points, normals=normals, features=colors)
+
+    def save(
+        self,
+        data: Pointclouds,
+        path: FileLike,
+        path_manager: PathManager | None,
+        binary: bool | None,
+        decimal_places: int | None = None,
+        colors_as_uint8: bool = False,
+        **kwargs: Any,
+    ) -> bool:
+        """Write one cloud, its normals, and its features if they are three, as colours.
+
+        Binary, in the machine's byte order, unless `binary` is False.
+
+        Raises:
+            ValueError: the batch has not exactly one cloud, or a number is not finite.
+            OSError: the file cannot be written; what stood there before is untouched.
+        """
+        if not endswith(path, self.known_suffixes):
+            return False
+        points, normals, features = single_cloud(data).get_cloud(0)
+        content = _Content(points, None)
+        if normals is not None:
+            content.add(("nx", "ny", "nz"), normals, "normals")
+        if features is not None and features.shape[-1] == 3:
+            content.add(("red", "green", "blue"), features, "features", colors_as_uint8)
+        elif features is not None:
+            warnings.warn(f"PLY files hold RGB colours, not {features.shape[-1]} features; not saved", stacklevel=4)
+        write_sink(path, content.render(binary is False, decimal_places), path_manager)
+        return True

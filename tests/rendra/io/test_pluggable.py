@@ -7,23 +7,22 @@ import torch
 from assertions import assert_close
 
 from rendra.io import IO
-from rendra.io.obj_io import MeshObjFormat
 from rendra.io.pluggable_formats import MeshFormatInterpreter, PointcloudFormatInterpreter, endswith
-from rendra.io.ply_io import MeshPlyFormat
 from rendra.renderer.mesh.textures import TexturesAtlas, TexturesUV, TexturesVertex
-from rendra.structures import Meshes
+from rendra.structures import Meshes, Pointclouds
 from rendra.utils.ico_sphere import ico_sphere
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".OBJ", ".PLY"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".glb", ".gltf", ".stl", ".OBJ", ".GLB"])
 @pytest.mark.parametrize("as_path", [str, lambda path: path])
 def test_round_trip_by_suffix(tmp_path, suffix, as_path):
     mesh = ico_sphere(1)
     path = as_path(tmp_path / f"sphere{suffix}")
     IO().save_mesh(mesh, path)
     back = IO().load_mesh(path)
-    assert_close(back.verts_packed(), mesh.verts_packed(), atol=1e-6)
-    assert torch.equal(back.faces_packed(), mesh.faces_packed())
+    corners, corners_back = (m.verts_packed()[m.faces_packed()] for m in (mesh, back))
+    assert_close(corners_back, corners, atol=1e-6)
+    assert len(back.verts_packed()) == len(mesh.verts_packed())
     assert back.textures is None
 
 
@@ -58,23 +57,32 @@ def test_obj_cannot_hold_an_atlas(tmp_path):
 
 
 def test_errors_name_the_path_and_what_would_have_worked(tmp_path):
-    with pytest.raises(ValueError, match=r"No mesh interpreter found to read mesh\.xyz\. Registered: \.obj, \.ply"):
+    meshes, clouds = r"\.glb, \.gltf, \.obj, \.off, \.ply, \.stl\.", r"\.glb, \.gltf, \.obj, \.off, \.ply, \.xyz\."
+    with pytest.raises(ValueError, match=rf"No mesh interpreter found to read mesh\.xyz\. Registered: {meshes}"):
         IO().load_mesh("mesh.xyz")
-    with pytest.raises(ValueError, match=r"No mesh interpreter found to write to mesh\.xyz"):
+    with pytest.raises(ValueError, match=rf"No mesh interpreter found to write to mesh\.xyz\. Registered: {meshes}"):
         IO().save_mesh(ico_sphere(0), "mesh.xyz")
     with pytest.raises(ValueError, match="No format is registered"):
         IO(include_default_formats=False).load_mesh("mesh.obj")
-    with pytest.raises(ValueError, match=r"No point cloud interpreter found to read cloud\.ply"):
-        IO().load_pointcloud("cloud.ply")
-    with pytest.raises(ValueError, match=r"No point cloud interpreter found to write to cloud\.ply"):
-        IO().save_pointcloud(object(), "cloud.ply")
+    with pytest.raises(ValueError, match=rf"No point cloud interpreter found to read a\.stl\. Registered: {clouds}"):
+        IO().load_pointcloud("a.stl")
+    with pytest.raises(
+        ValueError, match=rf"No point cloud interpreter found to write to a\.stl\. Registered: {clouds}"
+    ):
+        IO().save_pointcloud(Pointclouds([torch.zeros(1, 3)]), "a.stl")
+    with pytest.raises(ValueError, match="expects a Pointclouds object, got str"):
+        IO().save_pointcloud("data", tmp_path / "cloud.ply")
     with pytest.raises(ValueError, match="expects a Meshes object, got int"):
         IO().save_mesh(3, tmp_path / "mesh.ply")
     with pytest.raises(ValueError, match="OBJ is a text format"):
         IO().save_mesh(ico_sphere(0), tmp_path / "mesh.obj", binary=True)
-    for suffix in ("obj", "ply"):
+    for suffix in ("glb", "gltf", "obj", "off", "ply", "stl"):
         with pytest.raises(ValueError, match="a file holds one mesh, but the batch has 2"):
             IO().save_mesh(ico_sphere(0).extend(2), tmp_path / f"mesh.{suffix}")
+    for suffix in ("glb", "gltf", "obj", "off", "ply", "xyz"):
+        with pytest.raises(ValueError, match="a file holds one point cloud, but the batch has 2"):
+            IO().save_pointcloud(Pointclouds([torch.zeros(1, 3)] * 2), tmp_path / f"cloud.{suffix}")
+    assert list(tmp_path.iterdir()) == []
 
 
 class _Reverse(MeshFormatInterpreter):
@@ -108,18 +116,23 @@ def test_the_format_registered_last_is_asked_first():
     cloud = _Cloud()
     io.register_pointcloud_format(cloud)
     assert io.load_pointcloud("x") == "cloud"
-    io.save_pointcloud("data", "x")
-    assert cloud.saved == ["data"]
+    data = Pointclouds([torch.zeros(1, 3)])
+    io.save_pointcloud(data, "x.ply")
+    assert cloud.saved == [data]
     for register in (io.register_meshes_format, io.register_pointcloud_format):
         with pytest.raises(ValueError, match="Invalid interpreter"):
             register(object())
 
 
 def test_interpreters_pass_on_what_is_not_theirs():
-    for each in (MeshObjFormat(), MeshPlyFormat()):
-        assert each.read("a.stl", True, "cpu", None) is None
-        assert each.save(ico_sphere(0), "a.stl", None, None) is False
+    for each in IO().mesh_interpreters:
+        assert each.read("a.usd", True, "cpu", None) is None
+        assert each.save(ico_sphere(0), "a.usd", None, None) is False
         assert each.read(object(), True, "cpu", None) is None
+    for each in IO().pointcloud_interpreters:
+        assert each.read("a.las", "cpu", None) is None
+        assert each.save(Pointclouds([torch.zeros(1, 3)]), "a.las", None, None) is False
+        assert each.read(object(), "cpu", None) is None
 
 
 def test_endswith():
@@ -159,7 +172,13 @@ def test_a_path_manager_sees_every_path():
     uv = TexturesUV(torch.rand(1, 4, 4, 3), [torch.tensor([[0, 1, 2]])], [torch.rand(3, 2)])
     io = IO(path_manager=storage)
     io.save_mesh(textured(uv), "s3://bucket/mesh.obj")
-    io.save_mesh(textured(None), "s3://bucket/mesh.ply")
-    assert set(storage.files) == {f"s3://bucket/mesh.{suffix}" for suffix in ("obj", "mtl", "png", "ply")}
+    io.save_mesh(textured(uv), "s3://bucket/mesh.glb")
+    for suffix in ("ply", "off", "stl"):
+        io.save_mesh(textured(None), f"s3://bucket/mesh.{suffix}")
+        assert len(io.load_mesh(f"s3://bucket/mesh.{suffix}").verts_packed()) == 3
     assert isinstance(io.load_mesh("s3://bucket/mesh.obj").textures, TexturesUV)
-    assert len(io.load_mesh("s3://bucket/mesh.ply").verts_packed()) == 3
+    assert isinstance(io.load_mesh("s3://bucket/mesh.glb").textures, TexturesUV)
+    io.save_pointcloud(Pointclouds([torch.eye(3)]), "s3://bucket/cloud.xyz")
+    assert len(io.load_pointcloud("s3://bucket/cloud.xyz").points_packed()) == 3
+    meshes = {f"s3://bucket/mesh.{suffix}" for suffix in ("obj", "mtl", "png", "ply", "off", "stl", "glb")}
+    assert set(storage.files) == meshes | {"s3://bucket/cloud.xyz"}
