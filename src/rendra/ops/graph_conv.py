@@ -7,7 +7,7 @@ from rendra.structures.sparse_matrix import SparseMatrix
 
 
 class GraphConv(nn.Module):
-    """y_i = W0 x_i + b0 + sum over neighbours j of (W1 x_j + b1): Gkioxari et al., "Mesh R-CNN", ICCV 2019, Sec. 3.1.
+    """y_i = W0 x_i + b0 + sum over neighbours j of (W1 x_j + b1): Gkioxari et al., "Mesh R-CNN", ICCV 2019.
 
     Attributes:
         w0: the linear layer of the vertex itself.

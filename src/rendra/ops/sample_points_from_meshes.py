@@ -25,7 +25,7 @@ def sample_points_from_meshes(
 
     A face is drawn by its share of its mesh's area, and a point on it with barycentric coordinates
     (1 - sqrt(u), sqrt(u) (1 - v), sqrt(u) v) for u, v uniform in [0, 1) (Osada et al., "Shape Distributions",
-    ACM TOG 2002, Sec. 4.1). Differentiable with respect to vertices and textures, for the faces and coordinates
+    ACM TOG 2002). Differentiable with respect to vertices and textures, for the faces and coordinates
     that were drawn.
 
     Args:

@@ -16,7 +16,7 @@ def vert_align(
     padding_mode: str = "zeros",
     align_corners: bool = True,
 ) -> Tensor:
-    """Read feature maps at the x and y of vertices or points (Wang et al., "Pixel2Mesh", ECCV 2018, Sec. 3.3).
+    """Read feature maps at the x and y of vertices or points (Wang et al., "Pixel2Mesh", ECCV 2018).
 
     Args:
         feats: maps (N, C, H, W), or several of them, which may differ in C, H and W.
