@@ -100,7 +100,7 @@ def _control_points(world: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Ten
     centroid = wmean(world, weights)
     centred = world - centroid
     variances, axes = symmetric_eigen((centred * weights[..., None]).mT @ centred)
-    longest = variances[:, 2:].clamp(min=torch.finfo(variances.dtype).tiny)
+    longest = variances[:, 2:].clamp(min=torch.finfo(variances.dtype).eps ** 2)
     thin = variances <= _FLAT**2 * longest
     lengths = torch.where(thin, longest, variances).sqrt()  # (N, 3), shortest first
     controls = torch.cat([centroid, centroid + lengths[..., None] * axes.mT], 1)

@@ -166,6 +166,9 @@ def iterative_closest_point(
 
     Raises:
         ValueError: batches or dimensions differ, or a start of the wrong shape.
+
+    Warns:
+        UserWarning: the last pairs leave the rotation open.
     """
     start, num_points_X = convert_pointclouds_to_tensor(X)
     target, num_points_Y = convert_pointclouds_to_tensor(Y)
@@ -185,7 +188,6 @@ def iterative_closest_point(
         assert nearest is not None
         matched = nearest[:, :, 0]
         transform, stretch = align_weighted(start, matched, weights, estimate_scale, allow_reflection)
-        _warn_if_ambiguous(stretch, allow_reflection)
         moved = _apply(transform, start)
         history.append(transform)
         before, rmse = rmse, _root_mean_square(moved - matched, weights)
@@ -193,6 +195,8 @@ def iterative_closest_point(
         if verbose:
             mean = rmse.detach().mean().item()
             print(f"ICP iteration {len(history)}: mean rmse = {mean:1.2e}")  # noqa: T201 - asked for
+    if history:
+        _warn_if_ambiguous(stretch, allow_reflection)
     result = X.update_padded(moved) if is_pointclouds(X) else moved
     return ICPSolution(converged, rmse, result, transform, history)
 
