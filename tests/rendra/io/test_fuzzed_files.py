@@ -14,7 +14,18 @@ from file_limits import within_limits
 from file_mutations import damaged, edits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_files import Asset, colored_obj_asset, image_bytes, obj_asset, ply_asset
+from small_files import (
+    Asset,
+    colored_obj_asset,
+    glb_asset,
+    gltf_asset,
+    image_bytes,
+    obj_asset,
+    off_asset,
+    ply_asset,
+    stl_asset,
+    xyz_asset,
+)
 
 from rendra.io import IO, MeshFormatError, load_obj, load_ply
 from rendra.io.mtl_io import load_mtl
@@ -145,6 +156,17 @@ CASES: dict[str, tuple[Callable[[Asset], None], Asset, str]] = {
 for _encoding in ENCODINGS:
     CASES[f"load_ply {_encoding}"] = (check_ply, ply_asset(_encoding), "mesh.ply")
     CASES[f"load_mesh ply {_encoding}"] = (check_mesh, ply_asset(_encoding), "mesh.ply")
+for _asset, _label in (
+    (glb_asset(True), "textured"), (glb_asset(False), "coloured"), (off_asset(True), "coloured"),
+    (off_asset(False), "plain"), (stl_asset(True), "binary"), (stl_asset(False), "text"), (gltf_asset(), "in parts"),
+):  # fmt: skip
+    CASES[f"load_mesh {_asset.name} {_label}"] = (check_mesh, _asset, _asset.name)
+CASES["load_mesh gltf, its buffer"] = (check_mesh, gltf_asset(), "mesh.bin")
+for _asset, _label in (
+    (xyz_asset(3), "points"), (xyz_asset(6), "normals"), (ply_asset("ascii", False), "ascii"),
+    (ply_asset("binary_little_endian", False), "binary"),
+):  # fmt: skip
+    CASES[f"load_pointcloud {_asset.name} {_label}"] = (check_cloud, _asset, _asset.name)
 
 
 def outcome(case: str, data: bytes) -> str:
