@@ -25,9 +25,10 @@ NAMES = {
         hat hat_inv so3_exp_map so3_exponential_map so3_log_map so3_relative_angle so3_rotation_angle""",
     "rendra.transforms.transform3d": "Rotate RotateAxisAngle Scale Transform3d Translate",
     "rendra.structures": """
-        Meshes join_meshes_as_batch join_meshes_as_scene list_to_packed list_to_padded packed_to_list
-        padded_to_list""",
+        Meshes Pointclouds join_meshes_as_batch join_meshes_as_scene join_pointclouds_as_batch
+        join_pointclouds_as_scene list_to_packed list_to_padded packed_to_list padded_to_list""",
     "rendra.structures.meshes": "Meshes join_meshes_as_batch join_meshes_as_scene",
+    "rendra.structures.pointclouds": "Pointclouds join_pointclouds_as_batch join_pointclouds_as_scene",
     "rendra.structures.utils": "list_to_packed list_to_padded packed_to_list padded_to_list padded_to_packed",
     "rendra.io": "IO load_obj load_objs_as_meshes load_ply save_obj save_ply",
     "rendra.io.mtl_io": "load_mtl make_mesh_texture_atlas",
@@ -36,15 +37,24 @@ NAMES = {
     "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
     "rendra.io.ply_io": "load_ply save_ply",
     "rendra.ops": """
-        GraphConv SubdivideMeshes cot_laplacian interpolate_face_attributes laplacian mesh_face_areas_normals
-        norm_laplacian sample_points_from_meshes taubin_smoothing vert_align""",
+        GraphConv SubdivideMeshes convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
+        efficient_pnp estimate_pointcloud_local_coord_frames estimate_pointcloud_normals eyes get_point_covariances
+        interpolate_face_attributes is_pointclouds iterative_closest_point laplacian mesh_face_areas_normals
+        norm_laplacian packed_to_padded padded_to_packed sample_points_from_meshes taubin_smoothing vert_align wmean""",
     "rendra.ops.graph_conv": "GraphConv gather_scatter",
     "rendra.ops.interp_face_attrs": "interpolate_face_attributes",
     "rendra.ops.laplacian_matrices": "cot_laplacian laplacian norm_laplacian",
     "rendra.ops.mesh_face_areas_normals": "mesh_face_areas_normals",
     "rendra.ops.mesh_filtering": "taubin_smoothing",
+    "rendra.ops.packed_to_padded": "packed_to_padded padded_to_packed",
+    "rendra.ops.perspective_n_points": "EpnpSolution efficient_pnp",
+    "rendra.ops.points_alignment": """
+        ICPSolution SimilarityTransform corresponding_points_alignment iterative_closest_point""",
+    "rendra.ops.points_normals": "estimate_pointcloud_local_coord_frames estimate_pointcloud_normals",
     "rendra.ops.sample_points_from_meshes": "sample_points_from_meshes",
     "rendra.ops.subdivide_meshes": "SubdivideMeshes",
+    "rendra.ops.utils": """
+        convert_pointclouds_to_tensor eyes get_point_covariances is_pointclouds masked_gather wmean""",
     "rendra.ops.vert_align": "vert_align",
     "rendra.loss": "chamfer_distance mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency",
     "rendra.loss.mesh_edge_loss": "mesh_edge_loss",
@@ -148,6 +158,24 @@ SIGNATURES = {
         "join_meshes_as_batch": "meshes, include_textures=True",
         "join_meshes_as_scene": "meshes, include_textures=True",
     },
+    "rendra.structures.pointclouds": {
+        "Pointclouds": "points, normals=None, features=None",
+        "Pointclouds.estimate_normals": """self, neighborhood_size=50, disambiguate_directions=True,
+            assign_to_self=False""",
+        "Pointclouds.extend": "self, N",
+        "Pointclouds.get_cloud": "self, index",
+        "Pointclouds.inside_box": "self, box",
+        "Pointclouds.offset": "self, offsets_packed",
+        "Pointclouds.offset_": "self, offsets_packed",
+        "Pointclouds.scale": "self, scale",
+        "Pointclouds.scale_": "self, scale",
+        "Pointclouds.split": "self, split_sizes",
+        "Pointclouds.subsample": "self, max_points",
+        "Pointclouds.to": "self, device, copy=False",
+        "Pointclouds.update_padded": "self, new_points_padded, new_normals_padded=None, new_features_padded=None",
+        "join_pointclouds_as_batch": "pointclouds",
+        "join_pointclouds_as_scene": "pointclouds",
+    },
     "rendra.structures.utils": {
         "list_to_padded": "x, pad_size=None, pad_value=0.0, equisized=False",
         "padded_to_list": "x, split_size=None",
@@ -177,6 +205,20 @@ SIGNATURES = {
             texture_size, texture_wrap""",
     },
     "rendra.ops": {
+        "corresponding_points_alignment": """X, Y, weights=None, estimate_scale=False, allow_reflection=False,
+            eps=1e-9""",
+        "efficient_pnp": "x, y, weights=None, skip_quadratic_eq=False",
+        "estimate_pointcloud_local_coord_frames": """pointclouds, neighborhood_size=50, disambiguate_directions=True,
+            *, use_symeig_workaround=True""",
+        "estimate_pointcloud_normals": """pointclouds, neighborhood_size=50, disambiguate_directions=True, *,
+            use_symeig_workaround=True""",
+        "eyes": "dim, N, device=None, dtype=torch.float32",
+        "get_point_covariances": "points_padded, num_points_per_cloud, neighborhood_size",
+        "iterative_closest_point": """X, Y, init_transform=None, max_iterations=100, relative_rmse_thr=1e-6,
+            estimate_scale=False, allow_reflection=False, verbose=False""",
+        "packed_to_padded": "inputs, first_idxs, max_size",
+        "padded_to_packed": "inputs, first_idxs, num_inputs, max_size_dim=1",
+        "wmean": "x, weight=None, dim=-2, keepdim=True, eps=1e-9",
         "interpolate_face_attributes": "pix_to_face, barycentric_coords, face_attributes",
         "SubdivideMeshes": "meshes=None",
         "SubdivideMeshes.forward": "self, meshes, feats=None",
@@ -322,6 +364,11 @@ METHODS = {
         offset_verts_ sample_textures scale_verts scale_verts_ split submeshes textures to update_padded valid
         verts_list verts_normals_list verts_normals_packed verts_normals_padded verts_packed
         verts_packed_to_mesh_idx verts_padded verts_padded_to_packed_idx __getitem__ __len__""",
+    "rendra.structures.Pointclouds": """
+        clone cloud_to_packed_first_idx cpu cuda detach device equisized estimate_normals extend features_list
+        features_packed features_padded get_bounding_boxes get_cloud inside_box isempty normals_list normals_packed
+        normals_padded num_points_per_cloud offset offset_ packed_to_cloud_idx padded_to_packed_idx points_list
+        points_packed points_padded scale scale_ split subsample to update_padded valid __getitem__ __len__""",
     "rendra.renderer.CamerasBase": """
         clone get_camera_center get_full_projection_transform get_image_size get_ndc_camera_transform
         get_projection_transform get_world_to_view_transform get_znear in_ndc is_perspective to transform_points
