@@ -40,7 +40,8 @@ NAMES = {
         GraphConv SubdivideMeshes convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
         efficient_pnp estimate_pointcloud_local_coord_frames estimate_pointcloud_normals eyes get_point_covariances
         interpolate_face_attributes is_pointclouds iterative_closest_point laplacian mesh_face_areas_normals
-        norm_laplacian packed_to_padded padded_to_packed sample_points_from_meshes taubin_smoothing vert_align wmean""",
+        norm_laplacian packed_to_padded padded_to_packed sample_points_from_meshes taubin_smoothing vert_align
+        wmean""",
     "rendra.ops.graph_conv": "GraphConv gather_scatter",
     "rendra.ops.interp_face_attrs": "interpolate_face_attributes",
     "rendra.ops.laplacian_matrices": "cot_laplacian laplacian norm_laplacian",
