@@ -1,9 +1,10 @@
 """Nearest points between batches of clouds: the K nearest, those in a ball, and the sums that a chamfer loss takes."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from rendra.kernels.knn import reference
+from rendra.kernels.knn import numba_cpu, reference
 
 __all__ = ["nearest_points", "nearest_sums", "points_in_ball"]
 
@@ -32,7 +33,9 @@ def nearest_points(
     _check_clouds(p1, p2, lengths1, lengths2)
     _check_norm(norm)
     _check_count(K)
-    return reference.nearest_points(p1, p2, lengths1, lengths2, norm, K)
+    if not _is_fast(p1):
+        return reference.nearest_points(p1, p2, lengths1, lengths2, norm, K)
+    return _search_on_cpu(p1, p2, lengths1, lengths2, norm, K, -1.0)
 
 
 def points_in_ball(
@@ -60,7 +63,9 @@ def points_in_ball(
     _check_count(K)
     if not radius >= 0:
         raise ValueError(f"radius must be zero or positive, got {radius}")
-    return reference.points_in_ball(p1, p2, lengths1, lengths2, K, radius)
+    if not _is_fast(p1):
+        return reference.points_in_ball(p1, p2, lengths1, lengths2, K, radius)
+    return _search_on_cpu(p1, p2, lengths1, lengths2, 2, K, float(radius))
 
 
 def nearest_sums(
@@ -77,7 +82,7 @@ def nearest_sums(
         x_lengths: (N,) int64, how many points of each cloud of `x` count.
         y_lengths: (N,) int64, the same for `y`.
         x_weights: (N,) factor of the distances from `x` to `y`; no gradient flows into it.
-        y_weights: (N,) the same from `y` to `x`; where all are zero, that way is not searched.
+        y_weights: (N,) the same from `y` to `x`; where it is zero, that way is not searched.
         norm: 2 for squared Euclidean distances, 1 for sums of absolute differences.
 
     Returns:
@@ -88,7 +93,19 @@ def nearest_sums(
     """
     _check_clouds(x, y, x_lengths, y_lengths)
     _check_norm(norm)
-    return reference.nearest_sums(x, y, x_lengths, y_lengths, x_weights, y_weights, norm)
+    x_weights, y_weights = x_weights.detach(), y_weights.detach()
+    if not _is_fast(x):
+        return reference.nearest_sums(x, y, x_lengths, y_lengths, x_weights, y_weights, norm)
+    if x.shape[2] > 3:
+        there, _ = _search_on_cpu(x, y, x_lengths, y_lengths, norm, 1, -1.0)
+        back, _ = _search_on_cpu(y, x, y_lengths, x_lengths, norm, 1, -1.0)
+        return x_weights * there.sum((1, 2)) + y_weights * back.sum((1, 2))
+    wants = [torch.is_grad_enabled() and cloud.requires_grad for cloud in (x, y)]
+    return _sums_on_cpu(x, y, x_lengths, y_lengths, x_weights, y_weights, norm, *wants)[0]
+
+
+def _is_fast(points: Tensor) -> bool:
+    return points.device.type == "cpu" and points.dtype == torch.float32 and points.shape[2] > 0
 
 
 def _check_clouds(p1: Tensor, p2: Tensor, lengths1: Tensor, lengths2: Tensor) -> None:
@@ -120,3 +137,107 @@ def _check_norm(norm: int) -> None:
 def _check_count(K: int) -> None:
     if K < 1:
         raise ValueError(f"K must be at least 1, got {K}")
+
+
+def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
+
+
+def _axes(points: Tensor) -> np.ndarray:
+    """The three coordinates that trees over such points know: the widest; -1 where there are fewer."""
+    D = points.shape[2]
+    if D <= 3:
+        return np.array([*range(D), -1, -1])[:3]
+    spread = points.detach().reshape(-1, D).double().std(0, correction=0).nan_to_num(0.0, 0.0, 0.0)
+    return spread.argsort(descending=True, stable=True)[:3].numpy()
+
+
+@torch.library.custom_op("rendra::knn", mutates_args=(), device_types="cpu")
+def _search_on_cpu(
+    p1: Tensor, p2: Tensor, lengths1: Tensor, lengths2: Tensor, norm: int, K: int, radius: float
+) -> tuple[Tensor, Tensor]:
+    shape = (*p1.shape[:2], K)
+    dists, idx = p1.new_zeros(shape), p1.new_full(shape, -1, dtype=torch.int64)
+    numba_cpu.search(
+        _arrays(p1, p2), _arrays(lengths1, lengths2), _axes(p2), norm, radius, dists.numpy(), idx.numpy()
+    )
+    return dists, idx
+
+
+@_search_on_cpu.register_fake
+def _(p1, p2, lengths1, lengths2, norm, K, radius):  # type: ignore[no-untyped-def]
+    shape = (*p1.shape[:2], K)
+    return p1.new_empty(shape), p1.new_empty(shape, dtype=torch.int64)
+
+
+@torch.library.custom_op("rendra::knn_backward", mutates_args=(), device_types="cpu")
+def _gradient_on_cpu(p1: Tensor, p2: Tensor, norm: int, idx: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+    grads = numba_cpu.backward(_arrays(p1, p2), norm, *_arrays(idx, upstream))
+    return torch.from_numpy(grads[0]), torch.from_numpy(grads[1])
+
+
+@_gradient_on_cpu.register_fake
+def _(p1, p2, norm, idx, upstream):  # type: ignore[no-untyped-def]
+    contiguous = torch.contiguous_format
+    return torch.empty_like(p1, memory_format=contiguous), torch.empty_like(p2, memory_format=contiguous)
+
+
+def _remember(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
+    ctx.save_for_backward(inputs[0], inputs[1], output[1])
+    ctx.norm = inputs[4]
+    ctx.mark_non_differentiable(output[1])
+
+
+def _gradient(ctx, grad_dists, _):  # type: ignore[no-untyped-def]
+    p1, p2, idx = ctx.saved_tensors
+    return *_gradient_on_cpu(p1, p2, ctx.norm, idx, grad_dists), *[None] * 5
+
+
+_search_on_cpu.register_autograd(_gradient, setup_context=_remember)
+
+
+@torch.library.custom_op("rendra::nearest_sums", mutates_args=(), device_types="cpu")
+def _sums_on_cpu(
+    x: Tensor,
+    y: Tensor,
+    x_lengths: Tensor,
+    y_lengths: Tensor,
+    x_weights: Tensor,
+    y_weights: Tensor,
+    norm: int,
+    wants_x: bool,
+    wants_y: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The sums, and their gradients: one that is not wanted has no elements."""
+    slopes = [
+        cloud.new_empty(cloud.shape if wanted else (0, 0, 0)) for cloud, wanted in ((x, wants_x), (y, wants_y))
+    ]
+    weights = _arrays(x_weights.to(x.dtype), y_weights.to(x.dtype))
+    sums, _ = numba_cpu.nearest_sums(
+        _arrays(x, y), _arrays(x_lengths, y_lengths), weights, _axes(x), norm, _arrays(*slopes)
+    )
+    return torch.from_numpy(sums), *slopes
+
+
+@_sums_on_cpu.register_fake
+def _(x, y, x_lengths, y_lengths, x_weights, y_weights, norm, wants_x, wants_y):  # type: ignore[no-untyped-def]
+    nothing = (0, 0, 0)
+    slopes = x.new_empty(x.shape if wants_x else nothing), y.new_empty(y.shape if wants_y else nothing)
+    return x.new_empty(len(x)), *slopes
+
+
+def _remember_slopes(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
+    ctx.save_for_backward(*output[1:])
+    ctx.wants = inputs[7:9]
+    ctx.mark_non_differentiable(*output[1:])
+
+
+def _scaled_slopes(ctx, grad_sums, *_):  # type: ignore[no-untyped-def]
+    grads = [
+        slope * grad_sums[:, None, None] if wanted else None
+        for slope, wanted in zip(ctx.saved_tensors, ctx.wants, strict=True)
+    ]
+    return *grads, *[None] * 7
+
+
+_sums_on_cpu.register_autograd(_scaled_slopes, setup_context=_remember_slopes)

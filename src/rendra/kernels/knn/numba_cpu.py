@@ -1,0 +1,323 @@
+"""Nearest points on the CPU: the fast twin of `reference.py`.
+
+Each cloud is sorted along a curve, 16 points to a leaf; queries walk down the tree of the other cloud in the order of
+their own curve, so that the neighbours of one bound the search of the next. Gradients are gathered by the points that
+receive them. Notation: N clouds, P1 and P2 points, D coordinates, K neighbours; a slot is a place in the leaves.
+"""
+
+import math
+
+import numpy as np
+from numba import prange
+
+from rendra.kernels.knn.lanes import LANES, float_of_bits
+from rendra.kernels.knn.search import (
+    EMPTY,
+    EMPTY_IN_BALL,
+    collect,
+    key_above,
+    leaf_distance,
+    sort_heap,
+    upper_bound,
+)
+from rendra.kernels.knn.tree import (
+    INDEX_BITS,
+    INDEX_MASK,
+    LEAF,
+    MAX_LEVELS,
+    NOTHING,
+    build_tree,
+    find_roots,
+    tree_size,
+)
+from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
+
+_SLOTS_AT_ONCE = 4 * LANES  # whose points a thread asks for in turn
+_POINTS_AT_ONCE = 512  # whose gradients a thread gathers in turn
+_FAR = np.float32(np.inf)
+
+_Tree = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def search(
+    clouds: tuple[np.ndarray, np.ndarray],
+    lengths: tuple[np.ndarray, np.ndarray],
+    axes: np.ndarray,
+    norm: int,
+    radius: float,
+    dists: np.ndarray,
+    idx: np.ndarray,
+) -> int:
+    """Write dists and idx (N, P1, K) where there are neighbours; returns how many leaves were looked at.
+
+    A negative radius asks for the nearest points. `axes` (3,) names the coordinates that the trees know, -1 for none.
+    """
+    first, second = (_grow(cloud) for cloud in clouds)
+    K, D = dists.shape[2], clouds[0].shape[2]
+    looked_at = np.zeros(num_threads(), np.int64)
+    squared = np.float32(radius) * np.float32(radius) if radius >= 0 else np.float32(-1)
+    _build(*clouds, *lengths, axes, first, second, len(looked_at))
+    _search(clouds[0].reshape(-1, D), clouds[1].reshape(-1, D), *lengths, norm, squared, first, second,
+            dists.reshape(-1, K), idx.reshape(-1, K), looked_at)  # fmt: skip
+    return int(looked_at.sum())
+
+
+def backward(
+    clouds: tuple[np.ndarray, np.ndarray], norm: int, idx: np.ndarray, upstream: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients of both clouds; `upstream` (N, P1, K) is that of the distances, idx (N, P1, K) may be negative."""
+    grads = np.empty_like(clouds[0]), np.empty_like(clouds[1])
+    _pull(*clouds, norm, idx, upstream, *grads, num_threads())
+    return grads
+
+
+def nearest_sums(
+    clouds: tuple[np.ndarray, np.ndarray],
+    lengths: tuple[np.ndarray, np.ndarray],
+    weights: tuple[np.ndarray, np.ndarray],
+    axes: np.ndarray,
+    norm: int,
+    grads: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, int]:
+    """Sums (N,) both ways, and how many leaves were looked at; D at most 3.
+
+    Writes the gradients, every element; one that is not wanted has no elements.
+    """
+    first, second = (_grow(cloud) for cloud in clouds)
+    slots = max(first[1].shape[1], second[1].shape[1])
+    sums = np.zeros((2, len(clouds[0]), -(-slots // _SLOTS_AT_ONCE)))
+    match = np.empty((2, len(clouds[0]), slots), np.int32)
+    looked_at = np.zeros(num_threads(), np.int64)
+    _build(*clouds, *lengths, axes, first, second, len(looked_at))
+    _match(*lengths, *weights, norm, first, second, match, sums, looked_at)
+    if any(grad.size for grad in grads):
+        _pull_matched(*lengths, *weights, norm, first, second, match, *grads, len(looked_at))
+    totals = sums.sum(2)
+    return (weights[0] * totals[0] + weights[1] * totals[1]).astype(np.float32), int(looked_at.sum())
+
+
+def _grow(points: np.ndarray) -> _Tree:
+    """Room for the trees of a batch: leaves, indices, boxes, lowest indices, one row a cloud."""
+    leaves, blocks = tree_size(points.shape[1])
+    return (
+        np.empty((len(points), leaves * LEAF), np.float32),
+        np.empty((len(points), leaves * LANES), np.int32),
+        np.empty((len(points), blocks * 2 * LEAF), np.float32),
+        np.empty((len(points), blocks * LANES), np.int32),
+    )
+
+
+@parallel_kernel
+def _build(p1, p2, lengths1, lengths2, axes, first, second, workers):
+    clouds = len(lengths1)
+    for worker in prange(workers):
+        for cloud in range(worker, 2 * clouds, workers):
+            n = cloud // 2
+            points, length = (p1[n], lengths1[n]) if cloud % 2 == 0 else (p2[n], lengths2[n])
+            leaves, indices, boxes, lowest = first if cloud % 2 == 0 else second
+            build_tree(points, length, axes, leaves[n], indices[n], boxes[n], lowest[n])
+
+
+@parallel_kernel
+def _search(p1, p2, lengths1, lengths2, norm, radius, first, second, dists, idx, looked_at):
+    """p1 and p2 (N * P, D), dists and idx (N * P1, K)."""
+    clouds, workers, neighbours = len(lengths1), len(looked_at), idx.shape[1]
+    queries, order = first[0].reshape(-1), first[1].reshape(-1)
+    slots, empty = first[1].shape[1], EMPTY if radius < 0 else EMPTY_IN_BALL
+    tree = (second[0].reshape(-1), second[1].reshape(-1), second[2].reshape(-1), second[3].reshape(-1))
+    leaves_of_one, blocks_of_one = second[1].shape[1] // LANES, second[3].shape[1] // LANES
+    chunks = (slots + _SLOTS_AT_ONCE - 1) // _SLOTS_AT_ONCE
+    for worker in prange(workers):
+        roots, blocks = np.empty(MAX_LEVELS, np.int64), np.empty(MAX_LEVELS, np.int64)
+        masks, heap, seen = np.empty(MAX_LEVELS, np.int64), np.empty(neighbours, np.int64), 0
+        for chunk in range(worker, clouds * chunks, workers):
+            n = chunk // chunks
+            size, bound = min(neighbours, lengths2[n]), EMPTY
+            levels = find_roots(lengths2[n], n * leaves_of_one, n * blocks_of_one, roots)
+            begin = chunk % chunks * _SLOTS_AT_ONCE
+            base1, base2 = n * (len(p1) // clouds), n * (len(p2) // clouds)
+            end = min(begin + _SLOTS_AT_ONCE, lengths1[n]) if size else begin
+            for slot in range(n * slots + begin, n * slots + end):
+                i = base1 + order[slot]
+                x, y, z = _query(queries, slot)
+                if slot > n * slots + begin and radius < 0:
+                    bound = upper_bound(p1, i, p2, base2, norm, heap, size)
+                for k in range(size):
+                    heap[k] = empty
+                looks, _ = collect(p1, i, x, y, z, p2, base2, norm, radius, bound, tree, roots, levels, heap, size,
+                                   blocks, masks)  # fmt: skip
+                seen += looks
+                sort_heap(heap, size)
+                _write(heap, size, radius, dists, idx, i)
+        looked_at[worker] = seen
+
+
+@scalar_kernel
+def _query(queries, slot):
+    """Coordinates of a slot, as a query: +infinity where it stands at -infinity."""
+    place = slot // LANES * LEAF + slot % LANES
+    x, y, z = queries[place], queries[place + LANES], queries[place + 2 * LANES]
+    return (_FAR, _FAR, _FAR) if x == -_FAR else (x, y, z)
+
+
+@scalar_kernel
+def _write(keys, size, radius, dists, idx, i):
+    """Take sorted keys apart; places without a neighbour are left as they are."""
+    for k in range(size):
+        high, low = keys[k] >> INDEX_BITS, keys[k] & INDEX_MASK
+        index, bits = (low, high) if radius < 0 else (high, low)
+        if index != NOTHING:
+            idx[i, k] = index
+            dists[i, k] = float_of_bits(np.int32(bits))
+
+
+@parallel_kernel
+def _match(lengths1, lengths2, weights1, weights2, norm, first, second, match, sums, looked_at):
+    """The nearest slot of the other cloud for each slot, both ways, and the sums of the distances of every chunk."""
+    _, clouds, chunks = sums.shape
+    workers = len(looked_at)
+    for worker in prange(workers):
+        roots, scratch = np.empty(MAX_LEVELS, np.int64), np.empty((2, MAX_LEVELS), np.int64)
+        heap, seen = np.empty(1, np.int64), 0
+        nobody = np.empty((0, 3), np.float32)
+        for task in range(worker, 2 * clouds * chunks, workers):
+            way, n, chunk = task // chunks // clouds, task // chunks % clouds, task % chunks
+            own, other = (first, second) if way == 0 else (second, first)
+            length, num_others = (lengths1[n], lengths2[n]) if way == 0 else (lengths2[n], lengths1[n])
+            weight = weights1[n] if way == 0 else weights2[n]
+            queries, tree = own[0][n], (other[0][n], other[1][n], other[2][n], other[3][n])
+            matched = match[way, n]
+            levels = find_roots(num_others, 0, 0, roots)
+            begin, end = chunk * _SLOTS_AT_ONCE, min((chunk + 1) * _SLOTS_AT_ONCE, length)
+            total, nearest = 0.0, np.int64(-1)
+            for slot in range(begin, end if num_others and weight != 0 else begin):
+                x, y, z = _query(queries, slot)
+                heap[0] = EMPTY
+                if nearest >= 0:
+                    heap[0] = key_above(leaf_distance(tree[0], nearest, x, y, z, norm), tree[1][nearest]) - 1
+                looks, better = collect(nobody, 0, x, y, z, nobody, 0, norm, np.float32(-1), EMPTY, tree, roots, levels,
+                                        heap, 1, scratch[0], scratch[1])  # fmt: skip
+                nearest = better if better >= 0 else nearest
+                seen += looks
+                matched[slot] = nearest
+                total += float_of_bits(np.int32(heap[0] >> INDEX_BITS))
+            sums[way, n, chunk] = total
+        looked_at[worker] = seen
+
+
+@parallel_kernel
+def _pull_matched(lengths1, lengths2, weights1, weights2, norm, first, second, match, grad1, grad2, workers):
+    """Gradients of both clouds: each slot gathers from its match and from the slots that matched it."""
+    _, clouds, slots = match.shape
+    starts, sources = np.empty((2, clouds, slots + 2), np.int64), np.empty((2, clouds, slots), np.int64)
+    for worker in prange(workers):
+        for task in range(worker, 2 * clouds, workers):
+            way, n = task % 2, task // 2
+            from_length, to_length = (lengths1[n], lengths2[n]) if way == 0 else (lengths2[n], lengths1[n])
+            weight = weights1[n] if way == 0 else weights2[n]
+            wanted = (grad2.size if way == 0 else grad1.size) and weight != 0 and to_length
+            _invert(match[way, n], from_length if wanted else 0, starts[way, n, : to_length + 2], sources[way, n])
+    chunks = (slots + _POINTS_AT_ONCE - 1) // _POINTS_AT_ONCE
+    for worker in prange(workers):
+        for task in range(worker, 2 * clouds * chunks, workers):
+            way, n, chunk = task // chunks // clouds, task // chunks % clouds, task % chunks
+            grad = grad1 if way == 0 else grad2
+            own, other = (first, second) if way == 0 else (second, first)
+            length, num_others = (lengths1[n], lengths2[n]) if way == 0 else (lengths2[n], lengths1[n])
+            there, back = (weights1[n], weights2[n]) if way == 0 else (weights2[n], weights1[n])
+            if grad.size:
+                begin, end = chunk * _POINTS_AT_ONCE, (chunk + 1) * _POINTS_AT_ONCE
+                _gather(own[0][n], own[1][n], other[0][n], match[way, n], starts[1 - way, n], sources[1 - way, n],
+                        begin, min(end, length), there if num_others else np.float32(0), back, norm,
+                        grad[n])  # fmt: skip
+                grad[n, max(begin, length) : max(begin, min(end, grad.shape[1]))] = 0
+
+
+@scalar_kernel
+def _gather(own, indices, other, match, starts, sources, begin, end, there, back, norm, grad):
+    """Gradients of the slots [begin, end), written to the points that stand there."""
+    for slot in range(begin, end):
+        place = slot // LANES * LEAF + slot % LANES
+        x, y, z = own[place], own[place + LANES], own[place + 2 * LANES]
+        gx = gy = gz = np.float32(0)
+        if there != 0:
+            gx, gy, gz = _pull_of(other, match[slot], x, y, z, there, norm)
+        for entry in range(starts[slot], starts[slot + 1]):
+            px, py, pz = _pull_of(other, sources[entry], x, y, z, back, norm)
+            gx, gy, gz = gx + px, gy + py, gz + pz
+        index = indices[slot]
+        grad[index, 0] = gx
+        if grad.shape[1] > 1:
+            grad[index, 1] = gy
+        if grad.shape[1] > 2:
+            grad[index, 2] = gz
+
+
+@scalar_kernel
+def _pull_of(leaves, slot, x, y, z, weight, norm):
+    """Derivative of weight * distance with respect to x, y, z; zero if a difference is not finite."""
+    place = slot // LANES * LEAF + slot % LANES
+    dx, dy, dz = x - leaves[place], y - leaves[place + LANES], z - leaves[place + 2 * LANES]
+    if not (math.isfinite(dx) and math.isfinite(dy) and math.isfinite(dz)):
+        return np.float32(0), np.float32(0), np.float32(0)
+    return _slope(dx, norm) * weight, _slope(dy, norm) * weight, _slope(dz, norm) * weight
+
+
+@scalar_kernel
+def _slope(difference, norm):
+    """Derivative of one axis' share of the distance."""
+    if norm == 1:
+        return np.float32(1) if difference > 0 else (np.float32(-1) if difference < 0 else np.float32(0))
+    return difference + difference
+
+
+@parallel_kernel
+def _pull(p1, p2, norm, idx, upstream, grad1, grad2, workers):
+    """Gradients of both clouds: each point gathers from its neighbours, or from those whose neighbour it is."""
+    clouds, num_queries, neighbours = idx.shape
+    num_points = p2.shape[1]
+    starts = np.empty((clouds, num_points + 2), np.int64)
+    sources = np.empty((clouds, num_queries * neighbours), np.int64)
+    for worker in prange(workers):
+        for n in range(worker, clouds, workers):
+            _invert(idx[n].reshape(-1), num_queries * neighbours, starts[n], sources[n])
+    chunks = (max(num_queries, num_points) + _POINTS_AT_ONCE - 1) // _POINTS_AT_ONCE
+    for worker in prange(workers):
+        for task in range(worker, clouds * chunks, workers):
+            n, begin = task // chunks, task % chunks * _POINTS_AT_ONCE
+            for i in range(begin, min(begin + _POINTS_AT_ONCE, num_queries)):
+                grad1[n, i] = 0
+                for k in range(neighbours):
+                    if idx[n, i, k] >= 0:
+                        _add_pull(p1, i, p2, idx[n, i, k], n, upstream[n, i, k], norm, grad1, i)
+            for j in range(begin, min(begin + _POINTS_AT_ONCE, num_points)):
+                grad2[n, j] = 0
+                for entry in range(starts[n, j], starts[n, j + 1]):
+                    i, k = sources[n, entry] // neighbours, sources[n, entry] % neighbours
+                    _add_pull(p2, j, p1, i, n, upstream[n, i, k], norm, grad2, j)
+
+
+@scalar_kernel
+def _add_pull(own, i, other, j, n, gain, norm, grad, target):
+    """Add gain * derivative of the distance with respect to own[n, i]."""
+    for axis in range(own.shape[2]):
+        if not math.isfinite(own[n, i, axis] - other[n, j, axis]):
+            return
+    for axis in range(own.shape[2]):
+        grad[n, target, axis] += gain * _slope(own[n, i, axis] - other[n, j, axis], norm)
+
+
+@scalar_kernel
+def _invert(targets, count, starts, sources):
+    """Who names whom: targets[sources[starts[j] : starts[j + 1]]] are j, in their order; negative ones are nobody."""
+    starts[:] = 0
+    for i in range(count):
+        if targets[i] >= 0:
+            starts[targets[i] + 2] += 1
+    for j in range(2, len(starts)):
+        starts[j] += starts[j - 1]
+    # starts[j + 1] is where j begins; filling moves it to where j ends, which is where j + 1 begins
+    for i in range(count):
+        if targets[i] >= 0:
+            sources[starts[targets[i] + 1]] = i
+            starts[targets[i] + 1] += 1
