@@ -85,8 +85,17 @@ def test_a_mesh_without_area_gives_points_on_it() -> None:
     assert_finite(verts.grad)
 
 
-def test_a_large_face_does_not_hide_a_million_small_ones() -> None:
-    """In single precision the sum of areas would stand still after the first."""
+def test_a_random_number_at_the_end_of_its_range_stays_within_its_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    def largest(*shape: int, dtype: torch.dtype, **_: object) -> torch.Tensor:
+        return torch.ones(shape, dtype=dtype)  # beyond [0, 1), where rounding may lead
+
+    meshes = Meshes([ico_sphere(0).verts_packed() + 10 * i for i in range(3)], [ico_sphere(0).faces_packed()] * 3)
+    monkeypatch.setattr(torch, "rand", largest)
+    points = sample_points_from_meshes(meshes, 2)
+    assert_close(points.mean((1, 2)).round(decimals=-1), [0.0, 10, 20])
+
+
+def test_a_million_small_faces_weigh_as_much_as_one_large() -> None:
     many = 1_000_000
     verts = torch.tensor([[0.0, 0, 0], [1e3, 0, 0], [0, 1e3, 0], [0, 0, -1], [1, 0, -1], [0, 1, -1]])
     faces = torch.tensor([[0, 1, 2], [3, 4, 5]]).repeat_interleave(torch.tensor([1, many]), 0)
