@@ -418,7 +418,7 @@ def _joined_rows(name: str, batches: list[Ragged | None], lengths: Lengths) -> R
     present = [rows for rows in batches if rows is not None]
     if not present:
         return None
-    if len(present) < len(batches):
+    if len(present) < len(batches) and lengths.total > 0:
         raise ValueError(f"Pointclouds in the batch should either all have {name} or not, some have none")
     widths = sorted({rows.packed().shape[1] for rows in present})
     if len(widths) > 1:

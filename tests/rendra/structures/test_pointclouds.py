@@ -120,6 +120,7 @@ def test_joins_ignore_what_a_batch_without_points_lacks() -> None:
     joined = join_pointclouds_as_batch([hollow, filled])
     assert joined.num_points_per_cloud().tolist() == [0, 2, 3]
     assert torch.equal(joined.normals_packed(), filled.normals_packed())
+    assert len(join_pointclouds_as_batch([hollow, Pointclouds([]), random_clouds([0, 0])])) == 3
 
 
 def test_clouds_repeat_one_by_one(clouds: Pointclouds) -> None:
