@@ -55,7 +55,7 @@ def knn_points(
     """
     lengths1, lengths2 = lengths_of(p1, p2, lengths1, lengths2)
     dists, idx = nearest_points(p1, p2, lengths1, lengths2, norm, K)
-    idx = idx.clamp_(min=0)
+    idx = idx.clamp(min=0)  # not in place: the backward pass needs the marks of missing neighbours
     return KNN(dists, idx, knn_gather(p2, idx, lengths2) if return_nn else None)
 
 
