@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from small_files import glb_asset, ply_asset, stl_asset
 
 from rendra.io import IO, MeshFormatError, load_obj, load_ply
 
@@ -83,6 +84,52 @@ def test_malformed_obj(text, line, message):
     assert len(str(caught.value)) < 400
     assert caught.value.line == line
     assert isinstance(caught.value, ValueError)
+
+
+TRIANGLE_BYTES = TRIANGLE.encode()
+
+ODD_BUT_READ = {
+    "control characters are blanks": b"v 0\x1f0\x0b0\nv\x011 0 0\nv 0 1\x0c0\nf 1\x7f\n".replace(
+        b"\x7f", b"\x02 2 3"
+    ),
+    "names in Latin-1": b"# caf\xe9\ng \xff\n" + TRIANGLE_BYTES + b"o \xe4\nf 1 2 3\n",
+    "a continued line, then nothing": TRIANGLE_BYTES + b"f 1 2 3 \\\n",
+    "the end of file of DOS": TRIANGLE_BYTES + b"f 1 2 3\n\x1a",
+    "line ends of all three kinds but the last": TRIANGLE_BYTES.replace(b"\n", b"\r\n", 1) + b"f 1 2 3\n\r\n",
+    "numbers in every spelling": b"v +0 -0.e0 .0E+00\nv 1. 0 0\nv 0 1e0 1e-400\nf +1 02 0003\n",
+    "statements of other programs": TRIANGLE_BYTES + b"f 1 2 3\nvendor_data 7 x\nvt2 1\nfo 1 2 3\n",
+}
+
+
+@pytest.mark.parametrize("name", ODD_BUT_READ)
+def test_odd_but_read(name):
+    verts, faces, _ = load_obj(io.BytesIO(ODD_BUT_READ[name]))
+    assert verts.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert faces.verts_idx.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("data", "line", "message"),
+    [
+        (TRIANGLE.encode("utf-16"), 1, "a NUL byte"),
+        (b"\xff\xfe" + TRIANGLE.encode("utf-16-le"), 1, "a NUL byte"),
+        (TRIANGLE.encode("utf-16-be"), 1, "a NUL byte"),
+        ("v 0 0 \u0661\n".encode(), 1, "cannot read '\u0661'"),
+        (TRIANGLE_BYTES + b"f 1 2 3 \\", 4, "cannot read"),
+        (b"v 0 0 \xff\n", 1, "cannot read '\ufffd'"),
+        (b"v 0 0 \xc2\xa01\n", 1, "cannot read"),
+        (TRIANGLE_BYTES + b"f 1 2 \xef\xbb\xbf3\n", 4, "cannot read"),
+        (TRIANGLE_BYTES + b"v 0 0 0\rv 1 0 0\n", 4, "cannot read 'v'"),
+        (TRIANGLE_BYTES + b"f 1 2\x1f\n", 4, "at least three corners"),
+        (TRIANGLE_BYTES + b"f 1\x1f2 x\n", 4, "cannot read 'x'"),
+        (b"\x89PNG\r\n\x1a\nIHDR", 1, "unknown to OBJ"),
+    ],
+)
+def test_bytes_that_are_no_text(data, line, message):
+    with pytest.raises(MeshFormatError) as caught:
+        load_obj(io.BytesIO(data))
+    assert message in str(caught.value)
+    assert caught.value.line == line
 
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -173,6 +220,35 @@ def test_malformed_binary_faces(order, rows, message):
     body += b"".join(struct.pack(f"{order}{len(row)}i", *row) for row in rows)
     data = (head + "property list int int vertex_index\nend_header\n").encode() + body
     with pytest.raises(MeshFormatError, match=message):
+        load_ply(io.BytesIO(data))
+
+
+BINARY_ASSETS = [
+    ply_asset("binary_little_endian"), ply_asset("binary_big_endian"), ply_asset("binary_big_endian", False),
+    stl_asset(binary=True), glb_asset(textured=True), glb_asset(textured=False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("asset", BINARY_ASSETS, ids=lambda asset: asset.name)
+def test_no_binary_file_can_be_cut_short(asset, tmp_path):
+    path, whole = tmp_path / asset.name, asset.files[asset.name]
+    load = IO().load_pointcloud if "cloud" in asset.name else IO().load_mesh
+    path.write_bytes(whole)
+    load(path)
+    for length in [*range(0, len(whole), 1 + len(whole) // 200), *range(len(whole) - 9, len(whole))]:
+        path.write_bytes(whole[:length])
+        with pytest.raises(MeshFormatError, match=asset.name):
+            load(path)
+
+
+@pytest.mark.parametrize("claims", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("is_", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_a_body_of_another_encoding_than_the_header_says(claims, is_):
+    data = ply_asset(is_).files["mesh.ply"].replace(is_.encode(), claims.encode(), 1)
+    if claims == is_:
+        assert len(load_ply(io.BytesIO(data))[1]) == 4
+        return
+    with pytest.raises(MeshFormatError):
         load_ply(io.BytesIO(data))
 
 
@@ -284,6 +360,33 @@ def test_the_caller_may_let_paths_out(secret):
     obj.write_text("mtllib m.mtl\nusemtl a\n" + TRIANGLE + "vt 0 0\nf 1/1 2/1 3/1\n")
     mesh = IO().load_mesh(obj, allow_outside=True)
     assert mesh.textures.maps_padded().tolist() == [[[[1, 0, 0]]]]
+
+
+def test_links_that_stay_inside_are_followed(tmp_path):
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "real.mtl").write_text("newmtl a\nKd 0 1 0\n")
+    os.symlink("deep/real.mtl", tmp_path / "m.mtl")
+    os.symlink("circle.mtl", tmp_path / "circle.mtl")
+    (tmp_path / "m.obj").write_text("mtllib m.mtl\nusemtl a\n")
+    assert load_obj(tmp_path / "m.obj")[2].material_colors["a"]["diffuse_color"].tolist() == [0, 1, 0]
+    (tmp_path / "m.obj").write_text("mtllib circle.mtl\nusemtl a\n")
+    with pytest.warns(UserWarning, match="does not exist"):
+        load_obj(tmp_path / "m.obj")
+
+
+@pytest.mark.parametrize("content", ["newmtl a\n".encode("utf-16"), b"newmtl \xff\nmap_Kd \xff.png\n", b"\0\0\0\0"])
+def test_libraries_that_are_no_text_define_nothing_that_is_used(tmp_path, content):
+    (tmp_path / "m.mtl").write_bytes(content)
+    (tmp_path / "m.obj").write_text("mtllib m.mtl\nusemtl a\n")
+    with pytest.warns(UserWarning, match="does not define it"):
+        load_obj(tmp_path / "m.obj")
+
+
+def test_a_colour_beyond_single_precision_is_refused(tmp_path):
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1e39 0 0\n")
+    (tmp_path / "m.obj").write_text("mtllib m.mtl\nusemtl a\n")
+    with pytest.raises(MeshFormatError, match="bad material value; found '1e39 0 0'"):
+        load_obj(tmp_path / "m.obj")
 
 
 def test_a_name_with_nul_is_refused(tmp_path):
