@@ -78,8 +78,10 @@ class Asset:
         self.quantized = "KHR_mesh_quantization" in self.root.texts("extensionsUsed")
 
     def size(self) -> int:
-        """Bytes of the file and of all buffers and images that were read so far."""
-        return len(self._source.data) + sum(map(len, self._held.values()))
+        """Bytes of the file and of all its buffers."""
+        return len(self._source.data) + sum(
+            len(self._buffer(i)) for i, each in enumerate(self._buffers) if "uri" in each
+        )
 
     def rows(self, index: int) -> int:
         """How many rows an accessor says it has, before anything is read."""

@@ -11,6 +11,8 @@ from rendra.io._bulk_text import Positions
 from rendra.io._gltf_asset import Floats
 from rendra.io._gltf_materials import MIRROR, REPEAT, Material, Pictures, Texture
 from rendra.io._gltf_parts import Part
+from rendra.io._images import MAX_TEXTURE_PIXELS
+from rendra.io.errors import MeshFormatError
 from rendra.renderer.mesh.texture_packing import Sampling, pack_maps
 from rendra.renderer.mesh.textures import TexturesBase, TexturesUV, TexturesVertex
 
@@ -73,16 +75,7 @@ class _Patch:
 def _uv_texture(parts: list[Part], images: list[Tensor | None], name: str) -> TexturesUV:
     textures = [part.material.texture for part, image in zip(parts, images, strict=True) if image is not None]
     sampling = _sampling([each for each in textures if each is not None])
-    tinted: dict[tuple[int, tuple[float, ...] | None], Tensor] = {}
-    patches = []
-    for part, image in zip(parts, images, strict=True):
-        if image is None:
-            patches.append(_plain_patch(part, name))
-            continue
-        key = (id(image), part.material.factor)
-        if key not in tinted:
-            tinted[key] = _tinted(image, part.material)
-        patches.append(_Patch(tinted[key], *_unrolled(part, name)))
+    patches = _patches(parts, images, name)
     if len({id(patch.image) for patch in patches}) == 1:
         image, uvs = patches[0].image, [patch.uvs for patch in patches]
     else:
@@ -96,6 +89,27 @@ def _uv_texture(parts: list[Part], images: list[Tensor | None], name: str) -> Te
         padding_mode=sampling.padding_mode,
         sampling_mode=sampling.mode,
     )
+
+
+def _patches(parts: list[Part], images: list[Tensor | None], name: str) -> list[_Patch]:
+    """What each part with faces reads; parts of one image and one factor share it."""
+    tinted: dict[tuple[int, tuple[float, ...] | None], Tensor] = {}
+    patches, pixels = [], 0
+    for part, image in zip(parts, images, strict=True):
+        if image is None:
+            patches += [_plain_patch(part, name)] * bool(len(part.faces))
+            continue
+        key = (id(image), part.material.factor)
+        if key not in tinted:
+            pixels += image.shape[0] * image.shape[1]
+            if pixels > MAX_TEXTURE_PIXELS:
+                limit = f"at most {MAX_TEXTURE_PIXELS:,} pixels, or include_textures=False"
+                raise MeshFormatError(
+                    "the images, in all their tints, are too large", name, None, f"{pixels:,}", limit
+                )
+            tinted[key] = _tinted(image, part.material)
+        patches.append(_Patch(tinted[key], *_unrolled(part, name)))
+    return patches
 
 
 def _sampling(textures: list[Texture]) -> Sampling:
@@ -114,8 +128,8 @@ def _tinted(image: Tensor, material: Material) -> Tensor:
 def _plain_patch(part: Part, name: str) -> _Patch:
     """Nine texels of one colour; colours that differ from vertex to vertex are averaged."""
     colors = _colors(part)
-    mean = colors.mean(axis=0) if len(colors) else np.ones(3, dtype=np.float32)
-    if len(part.faces) and (colors != colors[:1]).any():
+    mean = colors.mean(axis=0)
+    if (colors != colors[:1]).any():
         warnings.warn(f"{name}: vertex colours beside textures are not kept, but their mean", stacklevel=7)
     image = torch.from_numpy(mean.astype(np.float32)).expand(3, 3, 3).contiguous()
     return _Patch(image, np.full((1, 2), 0.5, dtype=np.float32), np.zeros_like(part.faces))

@@ -5,6 +5,7 @@ their origin at the bottom left.
 """
 
 import warnings
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +22,7 @@ EXACT_V = "_RENDRA_V"  # v from the bottom left, where 1 - v has lost its last b
 VERTEX_NUMBER = "_RENDRA_VERTEX"  # which vertex a row is a copy of: two 16-bit halves, the lower first
 
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-_FREE_ROWS = 1 << 22  # rows that any file may give, and beyond it one for so many bytes
-_BYTES_A_ROW = 2
+_FREE_ROWS = 1 << 22  # vertices and corners that any file may show; beyond it, one for each of its bytes
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class _Reader:
 
     def __init__(self, asset: Asset) -> None:
         self._asset = asset
-        self._rows = 0
+        self._rows, self._limit = 0, _FREE_ROWS
         self._meshes: dict[int, list[Part]] = {}
         self._cost: dict[int, int] = {}
         self._lines = 0
@@ -88,13 +88,14 @@ class _Reader:
             primitives = self._asset.meshes[instance.mesh].items("primitives")
             self._cost[instance.mesh] = sum(map(self._rows_of, primitives))
         self._rows += self._cost[instance.mesh]
-        limit = max(_FREE_ROWS, self._asset.size() // _BYTES_A_ROW)
-        if self._rows > limit:
+        if self._rows > self._limit:
+            self._limit = max(_FREE_ROWS, self._asset.size())
+        if self._rows > self._limit:
             self._asset.meshes[instance.mesh].fail(
                 None,
-                "the scene shows the same data too often",
+                "the scene is too large for its file, which lies or shows the same data again and again",
                 f"{self._rows:,} vertices and corners up to {instance.node}",
-                f"at most {limit:,} in a file of this size",
+                f"at most {self._limit:,}",
             )
 
     def _rows_of(self, primitive: Item) -> int:
@@ -109,12 +110,14 @@ class _Reader:
         primitives = mesh.items("primitives")
         if not primitives:
             mesh.fail("primitives", "is missing or empty", expected="at least one primitive")
-        uses = [primitive.item("attributes").index("POSITION", 1 << 53, "") for primitive in primitives]  # type: ignore[union-attr]
+        attributes = [primitive.item("attributes") for primitive in primitives]
+        positions = [None if each is None else each.index("POSITION", 1 << 53, "accessors") for each in attributes]
+        uses = Counter(positions)
         parts = []
-        for primitive, positions in zip(primitives, uses, strict=True):
+        for primitive, number in zip(primitives, positions, strict=True):
             part = self._read_primitive(primitive)
             if part is not None:
-                parts.append(_compact(part) if uses.count(positions) > 1 else part)
+                parts.append(_compact(part) if uses[number] > 1 else part)
         return parts
 
     def _read_primitive(self, primitive: Item) -> Part | None:

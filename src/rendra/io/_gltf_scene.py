@@ -47,10 +47,7 @@ def instances(asset: Asset) -> list[Instance]:
         if number in seen:
             node.fail(None, "the node has two parents, or is its own ancestor")
         seen.add(number)
-        with np.errstate(over="ignore", invalid="ignore"):
-            to_world = parent @ _local(node)
-        if not np.isfinite(to_world).all():
-            node.fail(None, "the transform is not finite")
+        to_world = _chained(parent, node)
         mesh = node.index("mesh", len(asset.meshes), "meshes")
         if mesh is not None:
             moved = None if np.array_equal(to_world, _IDENTITY) else to_world
@@ -70,6 +67,17 @@ def _roots(asset: Asset) -> list[int]:
     if not roots:
         asset.nodes[0].fail(None, "every node is the child of another, so the nodes form a circle")
     return roots
+
+
+def _chained(parent: Matrix, node: Item) -> Matrix:
+    """(4, 4) from the node to the world."""
+    if not any(key in node for key in ("matrix", "translation", "rotation", "scale")):
+        return parent
+    with np.errstate(over="ignore", invalid="ignore"):
+        to_world = parent @ _local(node)
+    if not np.isfinite(to_world).all():
+        node.fail(None, "the transform is not finite")
+    return to_world
 
 
 def _local(node: Item) -> Matrix:

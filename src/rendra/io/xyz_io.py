@@ -82,6 +82,11 @@ def _layout(lines: Lines, block: Block, table: np.ndarray, columns: Sequence[str
         named = tuple(comment.decode("latin-1").split())
         if named in _LAYOUTS:
             return named
+    return _guess(table)
+
+
+def _guess(table: np.ndarray) -> tuple[str, ...]:
+    """The names of columns that nobody names."""
     if table.shape[1] != 6:
         return _LAYOUTS[0] if table.shape[1] == 3 else _LAYOUTS[3]
     behind = table[:, 3:]
@@ -159,13 +164,12 @@ class PointcloudXyzFormat(PointcloudFormatInterpreter):
         if binary:
             raise ValueError("XYZ is a text format: binary must be False or None")
         check_decimals(decimal_places)
-        number = "%.9g" if decimal_places is None else f"%.{decimal_places}f"
-        write_sink(path, _render(single_cloud(data), number), path_manager)
+        write_sink(path, _render(single_cloud(data), decimal_places), path_manager)
         return True
 
 
-def _render(cloud: Pointclouds, number: str) -> bytes:
-    """The whole file; more than bare points get a comment that names the columns."""
+def _render(cloud: Pointclouds, decimal_places: int | None) -> bytes:
+    """The whole file, with a comment that names the columns where they could be mistaken."""
     tables = [float_rows(cloud.points_list()[0], 3, "points", "num_points")]
     names: tuple[str, ...] = _POINT
     normals, features = cloud.normals_list(), cloud.features_list()
@@ -177,8 +181,11 @@ def _render(cloud: Pointclouds, number: str) -> bytes:
         names += _COLOR
     elif features is not None:
         warnings.warn(f"XYZ files hold RGB colours, not {features[0].shape[-1]} features; not saved", stacklevel=5)
-    head = f"# {' '.join(names)}\n".encode() if len(names) > 3 else b""
-    return head + format_rows(" ".join([number] * len(names)) + "\n", np.concatenate(tables, axis=1))
+    rows = np.concatenate(tables, axis=1)
+    plain = len(rows) > 0 and _guess(rows) == names and (decimal_places is None or "nx" not in names)
+    head = b"" if plain or len(names) == 3 else f"# {' '.join(names)}\n".encode()
+    number = "%.9g" if decimal_places is None else f"%.{decimal_places}f"
+    return head + format_rows(" ".join([number] * len(names)) + "\n", rows)
 
 
 def _demand_colors(features: Tensor) -> np.ndarray:
