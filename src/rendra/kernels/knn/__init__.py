@@ -209,9 +209,7 @@ def _sums_on_cpu(
     wants_y: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The sums, and their gradients: one that is not wanted has no elements."""
-    slopes = [
-        cloud.new_empty(cloud.shape if wanted else (0, 0, 0)) for cloud, wanted in ((x, wants_x), (y, wants_y))
-    ]
+    slopes = [cloud.new_empty(cloud.shape if wanted else (0, 0, 0)) for cloud, wanted in ((x, wants_x), (y, wants_y))]
     weights = _arrays(x_weights.to(x.dtype), y_weights.to(x.dtype))
     sums, _ = numba_cpu.nearest_sums(
         _arrays(x, y), _arrays(x_lengths, y_lengths), weights, _axes(x), norm, _arrays(*slopes)

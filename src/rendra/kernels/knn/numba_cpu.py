@@ -10,31 +10,34 @@ import math
 import numpy as np
 from numba import prange
 
-from rendra.kernels.knn.lanes import LANES, float_of_bits
+from rendra.kernels.knn.lanes import (
+    LANES,
+    float_of_bits,
+    read_int32,
+    read_int64,
+    write_float,
+    write_int64,
+)
 from rendra.kernels.knn.search import (
     EMPTY,
     EMPTY_IN_BALL,
+    SCRATCH,
+    Question,
     collect,
-    key_above,
-    leaf_distance,
-    sort_heap,
-    upper_bound,
-)
-from rendra.kernels.knn.tree import (
-    INDEX_BITS,
-    INDEX_MASK,
-    LEAF,
-    MAX_LEVELS,
-    NOTHING,
-    build_tree,
     find_roots,
-    tree_size,
+    leaf_distance,
+    near_key,
+    query_at,
+    sort_heap,
+    tree_at,
+    upper_bound,
+    walk_at,
 )
+from rendra.kernels.knn.tree import INDEX_BITS, INDEX_MASK, LEAF, NOTHING, build_tree, tree_size
 from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 
 _SLOTS_AT_ONCE = 4 * LANES  # whose points a thread asks for in turn
 _POINTS_AT_ONCE = 512  # whose gradients a thread gathers in turn
-_FAR = np.float32(np.inf)
 
 _Tree = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -53,13 +56,17 @@ def search(
     A negative radius asks for the nearest points. `axes` (3,) names the coordinates that the trees know, -1 for none.
     """
     first, second = (_grow(cloud) for cloud in clouds)
-    K, D = dists.shape[2], clouds[0].shape[2]
-    looked_at = np.zeros(num_threads(), np.int64)
+    workers, K = num_threads(), dists.shape[2]
+    scratch = np.empty((workers, SCRATCH + K), np.int64)
     squared = np.float32(radius) * np.float32(radius) if radius >= 0 else np.float32(-1)
-    _build(*clouds, *lengths, axes, first, second, len(looked_at))
-    _search(clouds[0].reshape(-1, D), clouds[1].reshape(-1, D), *lengths, norm, squared, first, second,
-            dists.reshape(-1, K), idx.reshape(-1, K), looked_at)  # fmt: skip
-    return int(looked_at.sum())
+    _build(*clouds, *lengths, axes, first, second, workers)
+    return int(
+        _search(
+            (clouds[0].shape[1], clouds[1].shape[1], clouds[0].shape[2], K), *lengths, norm, squared,
+            _addresses(*clouds), _addresses(*first), _addresses(*second), _addresses(dists, idx), scratch,
+            scratch.ctypes.data,
+        )
+    )  # fmt: skip
 
 
 def backward(
@@ -87,13 +94,15 @@ def nearest_sums(
     slots = max(first[1].shape[1], second[1].shape[1])
     sums = np.zeros((2, len(clouds[0]), -(-slots // _SLOTS_AT_ONCE)))
     match = np.empty((2, len(clouds[0]), slots), np.int32)
-    looked_at = np.zeros(num_threads(), np.int64)
-    _build(*clouds, *lengths, axes, first, second, len(looked_at))
-    _match(*lengths, *weights, norm, first, second, match, sums, looked_at)
+    workers = num_threads()
+    scratch = np.empty((workers, SCRATCH + 1), np.int64)
+    _build(*clouds, *lengths, axes, first, second, workers)
+    looked_at = _match(*lengths, *weights, norm, (clouds[0].shape[1], clouds[1].shape[1]), _addresses(*first), _addresses(*second), match, sums, scratch,
+                       scratch.ctypes.data)  # fmt: skip
     if any(grad.size for grad in grads):
-        _pull_matched(*lengths, *weights, norm, first, second, match, *grads, len(looked_at))
+        _pull_matched(*lengths, *weights, norm, first, second, match, *grads, workers)
     totals = sums.sum(2)
-    return (weights[0] * totals[0] + weights[1] * totals[1]).astype(np.float32), int(looked_at.sum())
+    return (weights[0] * totals[0] + weights[1] * totals[1]).astype(np.float32), int(looked_at)
 
 
 def _grow(points: np.ndarray) -> _Tree:
@@ -105,6 +114,11 @@ def _grow(points: np.ndarray) -> _Tree:
         np.empty((len(points), blocks * 2 * LEAF), np.float32),
         np.empty((len(points), blocks * LANES), np.int32),
     )
+
+
+def _addresses(*arrays: np.ndarray) -> tuple[int, ...]:
+    """Of arrays that the caller keeps alive."""
+    return tuple(array.ctypes.data for array in arrays)
 
 
 @parallel_kernel
@@ -119,90 +133,86 @@ def _build(p1, p2, lengths1, lengths2, axes, first, second, workers):
 
 
 @parallel_kernel
-def _search(p1, p2, lengths1, lengths2, norm, radius, first, second, dists, idx, looked_at):
-    """p1 and p2 (N * P, D), dists and idx (N * P1, K)."""
-    clouds, workers, neighbours = len(lengths1), len(looked_at), idx.shape[1]
-    queries, order = first[0].reshape(-1), first[1].reshape(-1)
-    slots, empty = first[1].shape[1], EMPTY if radius < 0 else EMPTY_IN_BALL
-    tree = (second[0].reshape(-1), second[1].reshape(-1), second[2].reshape(-1), second[3].reshape(-1))
-    leaves_of_one, blocks_of_one = second[1].shape[1] // LANES, second[3].shape[1] // LANES
+def _search(shape, lengths1, lengths2, norm, radius, clouds, first, second, outputs, scratch, scratch_address):
+    """Returns how many leaves were looked at; clouds, trees and outputs (dists, idx) by address."""
+    P1, P2, D, K = shape
+    slots, (leaves, blocks) = _num_slots(P1), tree_size(P2)
     chunks = (slots + _SLOTS_AT_ONCE - 1) // _SLOTS_AT_ONCE
+    workers, batch, looked_at = len(scratch), len(lengths1), 0
     for worker in prange(workers):
-        roots, blocks = np.empty(MAX_LEVELS, np.int64), np.empty(MAX_LEVELS, np.int64)
-        masks, heap, seen = np.empty(MAX_LEVELS, np.int64), np.empty(neighbours, np.int64), 0
-        for chunk in range(worker, clouds * chunks, workers):
+        walk = walk_at(scratch_address + 8 * scratch.shape[1] * worker)
+        seen = 0
+        for chunk in range(worker, batch * chunks, workers):
             n = chunk // chunks
-            size, bound = min(neighbours, lengths2[n]), EMPTY
-            levels = find_roots(lengths2[n], n * leaves_of_one, n * blocks_of_one, roots)
+            ask = Question(norm, D, radius, min(K, lengths2[n]))
+            tree, levels = tree_at(second, leaves, blocks, n), find_roots(lengths2[n], walk.roots)
+            own, order = first[0] + 4 * 3 * slots * n, first[1] + 4 * slots * n
+            points = clouds[1] + 4 * D * P2 * n
             begin = chunk % chunks * _SLOTS_AT_ONCE
-            base1, base2 = n * (len(p1) // clouds), n * (len(p2) // clouds)
-            end = min(begin + _SLOTS_AT_ONCE, lengths1[n]) if size else begin
-            for slot in range(n * slots + begin, n * slots + end):
-                i = base1 + order[slot]
-                x, y, z = _query(queries, slot)
-                if slot > n * slots + begin and radius < 0:
-                    bound = upper_bound(p1, i, p2, base2, norm, heap, size)
-                for k in range(size):
-                    heap[k] = empty
-                looks, _ = collect(p1, i, x, y, z, p2, base2, norm, radius, bound, tree, roots, levels, heap, size,
-                                   blocks, masks)  # fmt: skip
+            for slot in range(begin, min(begin + _SLOTS_AT_ONCE, lengths1[n]) if ask.size else begin):
+                i = P1 * n + read_int32(order, slot)
+                row, bound = clouds[0] + 4 * D * i, EMPTY
+                if slot > begin and radius < 0:
+                    bound = upper_bound(row, points, ask, walk.heap)
+                for k in range(ask.size):
+                    write_int64(walk.heap, k, EMPTY if radius < 0 else EMPTY_IN_BALL)
+                looks, _ = collect(row, query_at(own, slot), points, tree, levels, ask, bound, walk)
                 seen += looks
-                sort_heap(heap, size)
-                _write(heap, size, radius, dists, idx, i)
-        looked_at[worker] = seen
+                sort_heap(walk.heap, ask.size)
+                _write(walk.heap, ask, outputs[0] + 4 * K * i, outputs[1] + 8 * K * i)
+        looked_at += seen
+    return looked_at
 
 
 @scalar_kernel
-def _query(queries, slot):
-    """Coordinates of a slot, as a query: +infinity where it stands at -infinity."""
-    place = slot // LANES * LEAF + slot % LANES
-    x, y, z = queries[place], queries[place + LANES], queries[place + 2 * LANES]
-    return (_FAR, _FAR, _FAR) if x == -_FAR else (x, y, z)
+def _num_slots(num_points):
+    leaves, _ = tree_size(num_points)
+    return leaves * LANES
 
 
 @scalar_kernel
-def _write(keys, size, radius, dists, idx, i):
+def _write(keys, ask, dists, idx):
     """Take sorted keys apart; places without a neighbour are left as they are."""
-    for k in range(size):
-        high, low = keys[k] >> INDEX_BITS, keys[k] & INDEX_MASK
-        index, bits = (low, high) if radius < 0 else (high, low)
+    for k in range(ask.size):
+        key = read_int64(keys, k)
+        high, low = key >> INDEX_BITS, key & INDEX_MASK
+        index, bits = (low, high) if ask.radius < 0 else (high, low)
         if index != NOTHING:
-            idx[i, k] = index
-            dists[i, k] = float_of_bits(np.int32(bits))
+            write_int64(idx, k, index)
+            write_float(dists, k, float_of_bits(np.int32(bits)))
 
 
 @parallel_kernel
-def _match(lengths1, lengths2, weights1, weights2, norm, first, second, match, sums, looked_at):
+def _match(lengths1, lengths2, weights1, weights2, norm, shape, first, second, match, sums, scratch, scratch_address):
     """The nearest slot of the other cloud for each slot, both ways, and the sums of the distances of every chunk."""
-    _, clouds, chunks = sums.shape
-    workers = len(looked_at)
+    _, batch, chunks = sums.shape
+    workers, looked_at, ask = len(scratch), 0, Question(norm, 3, np.float32(-1), 1)
     for worker in prange(workers):
-        roots, scratch = np.empty(MAX_LEVELS, np.int64), np.empty((2, MAX_LEVELS), np.int64)
-        heap, seen = np.empty(1, np.int64), 0
-        nobody = np.empty((0, 3), np.float32)
-        for task in range(worker, 2 * clouds * chunks, workers):
-            way, n, chunk = task // chunks // clouds, task // chunks % clouds, task % chunks
-            own, other = (first, second) if way == 0 else (second, first)
+        walk = walk_at(scratch_address + 8 * scratch.shape[1] * worker)
+        seen = 0
+        for task in range(worker, 2 * batch * chunks, workers):
+            way, n, chunk = task // chunks // batch, task // chunks % batch, task % chunks
             length, num_others = (lengths1[n], lengths2[n]) if way == 0 else (lengths2[n], lengths1[n])
             weight = weights1[n] if way == 0 else weights2[n]
-            queries, tree = own[0][n], (other[0][n], other[1][n], other[2][n], other[3][n])
-            matched = match[way, n]
-            levels = find_roots(num_others, 0, 0, roots)
+            leaves, blocks = tree_size(shape[1 - way])
+            tree = tree_at(second if way == 0 else first, leaves, blocks, n)
+            own = (first[0] if way == 0 else second[0]) + 4 * 3 * _num_slots(shape[way]) * n
+            levels = find_roots(num_others, walk.roots)
             begin, end = chunk * _SLOTS_AT_ONCE, min((chunk + 1) * _SLOTS_AT_ONCE, length)
             total, nearest = 0.0, np.int64(-1)
             for slot in range(begin, end if num_others and weight != 0 else begin):
-                x, y, z = _query(queries, slot)
-                heap[0] = EMPTY
+                xyz, key = query_at(own, slot), EMPTY
                 if nearest >= 0:
-                    heap[0] = key_above(leaf_distance(tree[0], nearest, x, y, z, norm), tree[1][nearest]) - 1
-                looks, better = collect(nobody, 0, x, y, z, nobody, 0, norm, np.float32(-1), EMPTY, tree, roots, levels,
-                                        heap, 1, scratch[0], scratch[1])  # fmt: skip
+                    key = near_key(leaf_distance(tree.leaves, nearest, xyz, norm), read_int32(tree.indices, nearest))
+                write_int64(walk.heap, 0, key)
+                looks, better = collect(0, xyz, 0, tree, levels, ask, EMPTY, walk)
                 nearest = better if better >= 0 else nearest
                 seen += looks
-                matched[slot] = nearest
-                total += float_of_bits(np.int32(heap[0] >> INDEX_BITS))
+                match[way, n, slot] = nearest
+                total += float_of_bits(np.int32(read_int64(walk.heap, 0) >> INDEX_BITS))
             sums[way, n, chunk] = total
-        looked_at[worker] = seen
+        looked_at += seen
+    return looked_at
 
 
 @parallel_kernel

@@ -5,6 +5,8 @@ its distance. Keys order as the rules of the reference ask, ties included, so th
 order of the walk. The K smallest are kept in a heap whose root is the largest.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rendra.kernels.knn.lanes import (
@@ -16,117 +18,191 @@ from rendra.kernels.knn.lanes import (
     near_boxes_l1,
     near_points,
     near_points_l1,
+    read_float,
+    read_int32,
+    read_int64,
+    write_int64,
 )
-from rendra.kernels.knn.tree import BLOCK, INDEX_BITS, INDEX_MASK, LEAF, NOTHING
+from rendra.kernels.knn.tree import BLOCK, INDEX_BITS, INDEX_MASK, LEAF, MAX_LEVELS, NOTHING
 from rendra.kernels.parallel import scalar_kernel
 
 EMPTY = np.int64(0x7F800000) << INDEX_BITS | np.int64(NOTHING)  # infinitely far, above every index
 EMPTY_IN_BALL = np.int64(NOTHING) << INDEX_BITS
+SCRATCH = 3 * MAX_LEVELS  # numbers that a walk needs beside its heap
 
 _INFINITY = np.float32(np.inf)
 _NONE = np.int32(-1)
 _FEW = 4  # as many boxes are not worth finding the nearest of
 
 
+class Tree(NamedTuple):
+    """Where the tree of one cloud lies, by address; see `tree.py`."""
+
+    leaves: int
+    indices: int
+    boxes: int
+    lowest: int
+
+
+class Question(NamedTuple):
+    """What is asked of every query."""
+
+    norm: int
+    D: int
+    radius: float  # squared; negative asks for the nearest points
+    size: int  # K
+
+
+class Walk(NamedTuple):
+    """The scratch of one thread, by address, int64 each: the levels' first blocks, those visited, their masks; keys."""
+
+    roots: int
+    blocks: int
+    masks: int
+    heap: int
+
+
 @scalar_kernel
-def distance(p1, i, p2, j, norm):
-    """Of two points of (*, D) arrays, rounded as the vectors round it; infinite where it is not a number."""
+def walk_at(address):
+    """The scratch that starts at an address: SCRATCH numbers, then the heap."""
+    step = 8 * MAX_LEVELS
+    return Walk(address, address + step, address + 2 * step, address + 3 * step)
+
+
+@scalar_kernel
+def tree_at(trees, leaves, blocks, n):
+    """The tree of cloud n of a batch whose clouds have so many leaves and blocks each."""
+    return Tree(
+        trees[0] + 4 * LEAF * leaves * n,
+        trees[1] + 4 * LANES * leaves * n,
+        trees[2] + 4 * BLOCK * blocks * n,
+        trees[3] + 4 * LANES * blocks * n,
+    )
+
+
+@scalar_kernel
+def find_roots(length, roots):
+    """Write the first block of every level above the leaves; returns the number of levels."""
+    count, first, levels = (length + LANES - 1) // LANES, 0, 0
+    while count > 1 or levels == 0:
+        count = (count + LANES - 1) // LANES
+        levels += 1
+        write_int64(roots, levels, first)
+        first += count
+    return levels
+
+
+@scalar_kernel
+def query_at(leaves, slot):
+    """Coordinates of a place in the leaves, as a query: +infinity where it stands at -infinity."""
+    place = slot // LANES * LEAF + slot % LANES
+    x, y, z = read_float(leaves, place), read_float(leaves, place + LANES), read_float(leaves, place + 2 * LANES)
+    return (_INFINITY, _INFINITY, _INFINITY) if x == -_INFINITY else (x, y, z)
+
+
+@scalar_kernel
+def distance(first, second, norm, D):
+    """Of two points (D,) at two addresses, rounded as the vectors round it; infinite where it is not a number."""
     total = np.float32(0)
-    for axis in range(p1.shape[1]):
-        apart = p2[j, axis] - p1[i, axis]
+    for axis in range(D):
+        apart = read_float(second, axis) - read_float(first, axis)
         total += abs(apart) if norm == 1 else apart * apart
     return total if total <= _INFINITY else _INFINITY
 
 
 @scalar_kernel
-def collect(p1, i, x, y, z, p2, base, norm, radius, bound, tree, roots, levels, heap, size, blocks, masks):
-    """Put the smallest keys below `bound` into heap[:size], which the caller has filled, with EMPTY or candidates.
-
-    Returns the number of leaves that were looked at, and where in the leaves the last key that was kept stands, or -1.
-
-    The query is point i of `p1` (*, D), of which the tree knows x, y, z; the candidates are those of `p2` (*, D) from
-    `base` on. `roots` tells the first leaf and the first block of each level; a negative squared `radius` asks for the
-    nearest points; `blocks` and `masks` (MAX_LEVELS,) are scratch. No array is sliced here: views count references.
-    """
-    leaves, indices, boxes, lowest = tree
-    in_ball, is_flat = radius >= 0, p1.shape[1] <= 3
-    cut, cut_index, limit = _limits(heap[0], bound, radius)
-    level, looked_at, slot = levels, 0, np.int64(-1)
-    blocks[level] = roots[level]
-    masks[level] = _near_boxes(boxes, blocks[level], lowest, x, y, z, cut, cut_index, limit, norm)
-    while True:
-        mask = masks[level]
-        if mask == 0:
-            level += 1
-            if level > levels:
-                return looked_at, slot
-            rest = masks[level]
-            if slot >= 0 and rest & (rest - 1):  # what was found below may have ruled out others here
-                masks[level] &= _near_boxes(boxes, blocks[level], lowest, x, y, z, cut, cut_index, limit, norm)
-            continue
-        lane = first_bit(mask) if level == 1 else _promising_lane(boxes, blocks[level], x, y, z, mask, norm)
-        masks[level] = mask & ~(np.int64(1) << lane)
-        child = roots[level - 1] + (blocks[level] - roots[level]) * LANES + lane
-        if level > 1:
-            level -= 1
-            blocks[level] = child
-            masks[level] = _near_boxes(boxes, child, lowest, x, y, z, cut, cut_index, limit, norm)
-            continue
-        looked_at += 1
-        found = _near_points(leaves, child, indices, x, y, z, cut, cut_index, limit, norm)
-        while found:
-            lane = first_bit(found)
-            found &= found - 1
-            index = indices[child * LANES + lane]
-            if is_flat:
-                dist = leaf_distance(leaves, child * LANES + lane, x, y, z, norm)
-            else:
-                dist = distance(p1, i, p2, base + index, norm)
-            if in_ball:
-                key = np.int64(index) << INDEX_BITS | np.int64(float_bits(dist))
-                keep = dist < radius and key < heap[0]
-            else:
-                key = np.int64(float_bits(dist)) << INDEX_BITS | np.int64(index)
-                keep = key < min(heap[0], bound)
-            if keep:
-                _replace_root(heap, size, key)
-                cut, cut_index, limit = _limits(heap[0], bound, radius)
-                slot = child * LANES + lane
-
-
-@scalar_kernel
-def leaf_distance(leaves, slot, x, y, z, norm):
-    """From a query of two or three coordinates to a place in the leaves, rounded as the vectors round it."""
+def leaf_distance(leaves, slot, xyz, norm):
+    """From a query of at most three coordinates to a place in the leaves, rounded as the vectors round it."""
     place = slot // LANES * LEAF + slot % LANES
-    dx, dy, dz = leaves[place] - x, leaves[place + LANES] - y, leaves[place + 2 * LANES] - z
+    dx = read_float(leaves, place) - xyz[0]
+    dy = read_float(leaves, place + LANES) - xyz[1]
+    dz = read_float(leaves, place + 2 * LANES) - xyz[2]
     return abs(dx) + abs(dy) + abs(dz) if norm == 1 else dx * dx + dy * dy + dz * dz
 
 
 @scalar_kernel
-def key_above(dist, index):
-    """The least key that is larger than that of a candidate."""
-    return (np.int64(float_bits(dist)) << INDEX_BITS | np.int64(index)) + 1
+def near_key(dist, index):
+    """The key of a candidate for the nearest."""
+    return np.int64(float_bits(dist)) << INDEX_BITS | np.int64(index)
+
+
+@scalar_kernel
+def collect(row, xyz, points, tree, levels, ask, bound, walk):
+    """Put the smallest keys below `bound` into the heap, which the caller has filled, with EMPTY or candidates.
+
+    `row` is the address of the query, of which the tree knows xyz, and `points` that of the candidates (*, D).
+    Returns the number of leaves that were looked at, and where in the leaves the last key that was kept stands, or -1.
+    """
+    cut = _limits(read_int64(walk.heap, 0), bound, ask.radius)
+    level, looked_at, slot, block = levels, 0, np.int64(-1), np.int64(0)
+    mask = _near_boxes(tree, read_int64(walk.roots, level), xyz, cut, ask.norm)
+    while True:
+        if mask == 0:
+            if level == levels:
+                return looked_at, slot
+            level += 1
+            block, mask = read_int64(walk.blocks, level), read_int64(walk.masks, level)
+            if slot >= 0 and mask & (mask - 1):  # what was found below may have ruled out others here
+                mask &= _near_boxes(tree, read_int64(walk.roots, level) + block, xyz, cut, ask.norm)
+            continue
+        if level > 1:
+            lane = _promising_lane(tree, read_int64(walk.roots, level) + block, xyz, mask, ask.norm)
+            write_int64(walk.masks, level, mask & ~(np.int64(1) << lane))
+            write_int64(walk.blocks, level, block)
+            level -= 1
+            block = block * LANES + lane
+            mask = _near_boxes(tree, read_int64(walk.roots, level) + block, xyz, cut, ask.norm)
+            continue
+        leaf = block * LANES + first_bit(mask)
+        mask &= mask - 1
+        looked_at += 1
+        found = _near_points(tree, leaf, xyz, cut, ask.norm)
+        while found:
+            place = leaf * LANES + first_bit(found)
+            found &= found - 1
+            if _offer(row, xyz, points, tree, place, ask, bound, walk.heap):
+                cut = _limits(read_int64(walk.heap, 0), bound, ask.radius)
+                slot = place
+
+
+@scalar_kernel
+def _offer(row, xyz, points, tree, slot, ask, bound, heap):
+    """Put a candidate into the heap if it belongs there; whether it does."""
+    index = np.int64(read_int32(tree.indices, slot))
+    if ask.D <= 3:
+        dist = leaf_distance(tree.leaves, slot, xyz, ask.norm)
+    else:
+        dist = distance(row, points + 4 * ask.D * index, ask.norm, ask.D)
+    if ask.radius >= 0:
+        key = index << INDEX_BITS | np.int64(float_bits(dist))
+        keep = dist < ask.radius and key < read_int64(heap, 0)
+    else:
+        key = near_key(dist, index)
+        keep = key < min(read_int64(heap, 0), bound)
+    if keep:
+        _replace_root(heap, ask.size, key)
+    return keep
 
 
 @scalar_kernel
 def sort_heap(heap, size):
     """Turn the heap into ascending order, in place."""
     for end in range(size - 1, 0, -1):
-        last = heap[end]
-        heap[end] = heap[0]
+        last = read_int64(heap, end)
+        write_int64(heap, end, read_int64(heap, 0))
         _replace_root(heap, end, last)
 
 
 @scalar_kernel
-def upper_bound(p1, i, p2, base, norm, keys, size):
-    """A key above the nearest of point i: those of another query, keys[:size], measured from here."""
+def upper_bound(row, points, ask, keys):
+    """A key above the nearest of a query: those of another query, measured from here."""
     worst = np.int64(-1)
-    for k in range(size):
-        index = keys[k] & INDEX_MASK
+    for k in range(ask.size):
+        index = read_int64(keys, k) & INDEX_MASK
         if index == NOTHING:
             return EMPTY
-        worst = max(worst, key_above(distance(p1, i, p2, base + index, norm), index))
-    return worst
+        worst = max(worst, near_key(distance(row, points + 4 * ask.D * index, ask.norm, ask.D), index))
+    return worst + 1
 
 
 @scalar_kernel
@@ -139,21 +215,21 @@ def _limits(worst, bound, radius):
 
 
 @scalar_kernel
-def _near_boxes(boxes, block, lowest, x, y, z, cut, cut_index, limit, norm):
+def _near_boxes(tree, block, xyz, cut, norm):
     if norm == 1:
-        return near_boxes_l1(boxes, block * BLOCK, lowest, block * LANES, x, y, z, cut, cut_index, limit)
-    return near_boxes(boxes, block * BLOCK, lowest, block * LANES, x, y, z, cut, cut_index, limit)
+        return near_boxes_l1(tree.boxes, block * BLOCK, tree.lowest, block * LANES, *xyz, *cut)
+    return near_boxes(tree.boxes, block * BLOCK, tree.lowest, block * LANES, *xyz, *cut)
 
 
 @scalar_kernel
-def _near_points(leaves, leaf, indices, x, y, z, cut, cut_index, limit, norm):
+def _near_points(tree, leaf, xyz, cut, norm):
     if norm == 1:
-        return near_points_l1(leaves, leaf * LEAF, indices, leaf * LANES, x, y, z, cut, cut_index, limit)
-    return near_points(leaves, leaf * LEAF, indices, leaf * LANES, x, y, z, cut, cut_index, limit)
+        return near_points_l1(tree.leaves, leaf * LEAF, tree.indices, leaf * LANES, *xyz, *cut)
+    return near_points(tree.leaves, leaf * LEAF, tree.indices, leaf * LANES, *xyz, *cut)
 
 
 @scalar_kernel
-def _promising_lane(boxes, block, x, y, z, mask, norm):
+def _promising_lane(tree, block, xyz, mask, norm):
     """The nearest box of the mask if there are many, else any: then the search is well bounded already."""
     many = mask
     for _ in range(_FEW):
@@ -166,9 +242,11 @@ def _promising_lane(boxes, block, x, y, z, mask, norm):
         lane = first_bit(mask)
         mask &= mask - 1
         place = block * BLOCK + lane
-        dx = _outside(boxes[place], boxes[place + 3 * LANES], x)
-        dy = _outside(boxes[place + LANES], boxes[place + 4 * LANES], y)
-        dz = _outside(boxes[place + 2 * LANES], boxes[place + 5 * LANES], z)
+        dx, dy, dz = (
+            _outside(tree.boxes, place, xyz[0]),
+            _outside(tree.boxes, place + LANES, xyz[1]),
+            _outside(tree.boxes, place + 2 * LANES, xyz[2]),
+        )
         apart = dx + dy + dz if norm == 1 else dx * dx + dy * dy + dz * dz
         if apart < least:
             least, nearest = apart, lane
@@ -176,8 +254,9 @@ def _promising_lane(boxes, block, x, y, z, mask, norm):
 
 
 @scalar_kernel
-def _outside(low, high, q):
-    return max(max(low - q, q - high), np.float32(0))
+def _outside(boxes, place, q):
+    """How far a coordinate lies outside a box, along its axis."""
+    return max(max(read_float(boxes, place) - q, q - read_float(boxes, place + 3 * LANES)), np.float32(0))
 
 
 @scalar_kernel
@@ -188,10 +267,10 @@ def _replace_root(heap, size, key):
         child = 2 * place + 1
         if child >= size:
             break
-        if child + 1 < size and heap[child + 1] > heap[child]:
+        if child + 1 < size and read_int64(heap, child + 1) > read_int64(heap, child):
             child += 1
-        if heap[child] <= key:
+        if read_int64(heap, child) <= key:
             break
-        heap[place] = heap[child]
+        write_int64(heap, place, read_int64(heap, child))
         place = child
-    heap[place] = key
+    write_int64(heap, place, key)

@@ -30,12 +30,13 @@ _LONG_RUN = 4 * LANES  # of points in one cell
 _FAR = np.float32(-np.inf)
 
 
-def tree_size(num_points: int) -> tuple[int, int]:
+@scalar_kernel
+def tree_size(num_points):
     """Leaves and blocks that the tree of a cloud needs, at most; one of each at least."""
-    leaves = max(1, -(-num_points // LANES))
+    leaves = max(1, (num_points + LANES - 1) // LANES)
     blocks, level = 0, leaves
     while level > 1 or blocks == 0:
-        level = -(-level // LANES)
+        level = (level + LANES - 1) // LANES
         blocks += level
     return leaves, blocks
 
@@ -60,19 +61,6 @@ def build_tree(points, length, axes, leaves, indices, boxes, lowest):
         _box_blocks(boxes, lowest, level, count)
         level += count
         count = (count + LANES - 1) // LANES
-
-
-@scalar_kernel
-def find_roots(length, first_leaf, first_block, roots):
-    """Write where the leaves (roots[0]) and each level above them start; returns the number of levels above."""
-    roots[0] = first_leaf
-    count, levels = (length + LANES - 1) // LANES, 0
-    while count > 1 or levels == 0:
-        count = (count + LANES - 1) // LANES
-        levels += 1
-        roots[levels] = first_block
-        first_block += count
-    return levels
 
 
 @scalar_kernel
