@@ -31,11 +31,13 @@ NAMES = {
     "rendra.structures.pointclouds": "Pointclouds join_pointclouds_as_batch join_pointclouds_as_scene",
     "rendra.structures.utils": "list_to_packed list_to_padded packed_to_list padded_to_list padded_to_packed",
     "rendra.io": "IO load_obj load_objs_as_meshes load_ply save_obj save_ply",
+    "rendra.io.experimental_gltf_io": "MeshGlbFormat",
     "rendra.io.mtl_io": "load_mtl make_mesh_texture_atlas",
-    "rendra.io.obj_io": "load_obj load_objs_as_meshes save_obj",
+    "rendra.io.obj_io": "MeshObjFormat load_obj load_objs_as_meshes save_obj",
+    "rendra.io.off_io": "MeshOffFormat",
     "rendra.io.pluggable": "IO",
     "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
-    "rendra.io.ply_io": "load_ply save_ply",
+    "rendra.io.ply_io": "MeshPlyFormat PointcloudPlyFormat load_ply save_ply",
     "rendra.ops": """
         GraphConv SubdivideMeshes convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
         efficient_pnp estimate_pointcloud_local_coord_frames estimate_pointcloud_normals eyes get_point_covariances
