@@ -13,6 +13,7 @@ from torch import Tensor
 from rendra.io.errors import MeshFormatError
 
 MAX_TEXTURE_PIXELS = 8192 * 8192  # 805 MB once it is float32 RGB
+_PIXELS_AT_ONCE = 1 << 20
 _FORMATS = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP", "GIF", "PPM", "DDS")  # rasters only: EPS runs a program
 _SUFFIX = {"png": "png", "jpeg": "jpg"}
 
@@ -51,6 +52,19 @@ def _demand_size(image: Image.Image, name: str) -> None:
 
 
 def _rgb(image: Image.Image) -> npt.NDArray[np.float32]:
+    """(H, W, 3) in [0, 1], converted in strips: beside the result only the image itself takes memory."""
+    pixels = np.empty((image.height, image.width, 3), dtype=np.float32)
+    rows = max(1, _PIXELS_AT_ONCE // max(1, image.width))
+    for top in range(0, image.height, rows):
+        bottom = min(top + rows, image.height)
+        strip = image.crop((0, top, image.width, bottom))
+        strip.info = image.info  # a crop of a palette forgets which of its colours is transparent
+        pixels[top:bottom] = _rgb_strip(strip)
+    return pixels
+
+
+def _rgb_strip(image: Image.Image) -> npt.NDArray[np.float32]:
+    """(H, W, 3), or (H, W, 1) of grey."""
     if image.mode.startswith("I"):  # 16-bit grey, also where Pillow widened it to 32
         grey = np.asarray(image, dtype=np.float32) / 65535.0
     elif image.mode == "F":
@@ -58,7 +72,7 @@ def _rgb(image: Image.Image) -> npt.NDArray[np.float32]:
     else:
         flat = image.convert("RGBA") if "transparency" in image.info else image
         return np.asarray(flat.convert("RGB"), dtype=np.float32) / np.float32(255.0)
-    return np.repeat(grey.clip(0.0, 1.0)[..., None], 3, axis=2)
+    return grey.clip(0.0, 1.0)[..., None]
 
 
 def image_suffix(image_format: str) -> str:
