@@ -39,12 +39,14 @@ NAMES = {
     "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
     "rendra.io.ply_io": "MeshPlyFormat PointcloudPlyFormat load_ply save_ply",
     "rendra.ops": """
-        GraphConv SubdivideMeshes convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
+        GraphConv SubdivideMeshes ball_query knn_gather knn_points convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
         efficient_pnp estimate_pointcloud_local_coord_frames estimate_pointcloud_normals eyes get_point_covariances
         interpolate_face_attributes is_pointclouds iterative_closest_point laplacian mesh_face_areas_normals
         norm_laplacian packed_to_padded padded_to_packed sample_points_from_meshes taubin_smoothing vert_align
         wmean""",
     "rendra.ops.graph_conv": "GraphConv gather_scatter",
+    "rendra.ops.ball_query": "ball_query",
+    "rendra.ops.knn": "knn_gather knn_points",
     "rendra.ops.interp_face_attrs": "interpolate_face_attributes",
     "rendra.ops.laplacian_matrices": "cot_laplacian laplacian norm_laplacian",
     "rendra.ops.mesh_face_areas_normals": "mesh_face_areas_normals",
@@ -60,6 +62,7 @@ NAMES = {
         convert_pointclouds_to_tensor eyes get_point_covariances is_pointclouds masked_gather wmean""",
     "rendra.ops.vert_align": "vert_align",
     "rendra.loss": "chamfer_distance mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency",
+    "rendra.loss.chamfer": "chamfer_distance",
     "rendra.loss.mesh_edge_loss": "mesh_edge_loss",
     "rendra.loss.mesh_laplacian_smoothing": "mesh_laplacian_smoothing",
     "rendra.loss.mesh_normal_consistency": "mesh_normal_consistency",
@@ -235,6 +238,19 @@ SIGNATURES = {
         "taubin_smoothing": "meshes, lambd=0.53, mu=-0.53, num_iter=10",
         "vert_align": """feats, verts, return_packed=False, interp_mode='bilinear', padding_mode='zeros',
             align_corners=True""",
+    },
+    "rendra.loss.chamfer": {
+        "chamfer_distance": """x, y, x_lengths=None, y_lengths=None, x_normals=None, y_normals=None, weights=None,
+            batch_reduction='mean', point_reduction='mean', norm=2, single_directional=False, abs_cosine=True""",
+    },
+    "rendra.ops.ball_query": {
+        "ball_query": """p1, p2, lengths1=None, lengths2=None, K=500, radius=0.2, return_nn=True,
+            skip_points_outside_cube=False""",
+    },
+    "rendra.ops.knn": {
+        "knn_points": """p1, p2, lengths1=None, lengths2=None, norm=2, K=1, version=-1, return_nn=False,
+            return_sorted=True""",
+        "knn_gather": "x, idx, lengths=None",
     },
     "rendra.loss.mesh_edge_loss": {"mesh_edge_loss": "meshes, target_length=0.0"},
     "rendra.loss.mesh_laplacian_smoothing": {"mesh_laplacian_smoothing": "meshes, method='uniform'"},

@@ -1,7 +1,7 @@
 """Chamfer distance between point clouds.
 
-Barrow et al., "Parametric correspondence and chamfer matching", IJCAI 1977, in the squared form of Fan et al., "A point
-set generation network", CVPR 2017, Eq. 1. Notation: N clouds a batch, P points a cloud (padded), D coordinates.
+Barrow et al., "Parametric correspondence and chamfer matching", IJCAI 1977, in the squared form of Fan et al., "A
+point set generation network", CVPR 2017, Eq. 1. Notation: N clouds a batch, P points a cloud (padded), D coordinates.
 """
 
 from typing import NamedTuple
@@ -77,8 +77,7 @@ def chamfer_distance(
     _check_weights(weights, len(first.points))
     has_normals = first.normals is not None and second.normals is not None
     if point_reduction in ("mean", "sum") and not has_normals:
-        scales = (_scale(cloud, weights, point_reduction) for cloud in (first, second))
-        x_scale, y_scale = scales
+        x_scale, y_scale = (_scale(cloud, weights, point_reduction) for cloud in (first, second))
         loss = nearest_sums(
             first.points, second.points, first.lengths, second.lengths, x_scale,
             torch.zeros_like(y_scale) if single_directional else y_scale, norm,
@@ -86,7 +85,7 @@ def chamfer_distance(
         return _reduce_batch(loss, weights, batch_reduction), None
     ways = [(first, second)] if single_directional else [(first, second), (second, first)]
     losses = [_one_way(*way, weights, point_reduction, norm, abs_cosine) for way in ways]
-    dists, normals = ([loss[i] for loss in losses] for i in range(2))
+    dists, normals = [dist for dist, _ in losses], [normal for _, normal in losses if normal is not None]
     if point_reduction is None:
         return _all_or_one(dists), _all_or_one(normals) if has_normals else None
     total = torch.stack(dists).amax(0) if point_reduction == "max" else torch.stack(dists).sum(0)
@@ -185,5 +184,5 @@ def _reduce_batch(loss: Tensor, weights: Tensor | None, batch_reduction: str | N
     return loss.sum() / torch.where(total > 0, total, 1.0)
 
 
-def _all_or_one(values: list) -> _Loss:
+def _all_or_one(values: list[Tensor]) -> _Loss:
     return (values[0], values[1]) if len(values) == 2 else values[0]

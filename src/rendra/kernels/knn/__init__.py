@@ -1,4 +1,4 @@
-"""Nearest points between batches of clouds: the K nearest, those in a ball, and the sums that a chamfer loss takes."""
+"""Nearest points between batches of clouds: the K nearest, those in a ball, and the sums of a chamfer loss."""
 
 import numpy as np
 import torch
@@ -139,8 +139,8 @@ def _check_count(K: int) -> None:
         raise ValueError(f"K must be at least 1, got {K}")
 
 
-def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
-    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
+def _arrays(first: Tensor, second: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    return first.detach().contiguous().numpy(), second.detach().contiguous().numpy()
 
 
 def _axes(points: Tensor) -> np.ndarray:
@@ -209,12 +209,13 @@ def _sums_on_cpu(
     wants_y: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The sums, and their gradients: one that is not wanted has no elements."""
-    slopes = [cloud.new_empty(cloud.shape if wanted else (0, 0, 0)) for cloud, wanted in ((x, wants_x), (y, wants_y))]
+    nothing = (0, 0, 0)
+    x_slope, y_slope = x.new_empty(x.shape if wants_x else nothing), y.new_empty(y.shape if wants_y else nothing)
     weights = _arrays(x_weights.to(x.dtype), y_weights.to(x.dtype))
     sums, _ = numba_cpu.nearest_sums(
-        _arrays(x, y), _arrays(x_lengths, y_lengths), weights, _axes(x), norm, _arrays(*slopes)
+        _arrays(x, y), _arrays(x_lengths, y_lengths), weights, _axes(x), norm, _arrays(x_slope, y_slope)
     )
-    return torch.from_numpy(sums), *slopes
+    return torch.from_numpy(sums), x_slope, y_slope
 
 
 @_sums_on_cpu.register_fake

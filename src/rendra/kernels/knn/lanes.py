@@ -1,8 +1,8 @@
 """Sixteen boxes or points at once against one query: explicit vectors, where the compiler's own would be slower.
 
-LLVM cuts the vectors to what the machine has. Nothing is contracted or reordered: the distance to a box is rounded like
-that to a point, operation by operation, so that it never exceeds the distance to a point inside, not even in the last
-bit.
+LLVM cuts the vectors to what the machine has. Nothing is contracted or reordered: the distance to a box is rounded
+like that to a point, operation by operation, so that it never exceeds the distance to a point inside, not even in
+the last bit.
 
 Memory is named by its address here: an array counts its references, atomically, wherever it is passed on or unpacked,
 which in a search of 0.2 us costs more than the search. Whoever passes an address keeps the array alive.
@@ -143,7 +143,7 @@ near_boxes = _near(True, 2)
 near_boxes_l1 = _near(True, 1)
 near_points = _near(False, 2)
 near_points_l1 = _near(False, 1)
-"""`near_*(numbers, first, indices, first_index, qx, qy, qz, cut, cut_index, limit)`: the lanes that may matter, as bits.
+"""`near_*(numbers, first, indices, first_index, qx, qy, qz, cut, cut_index, limit)`: lanes that may matter, as bits.
 
 A lane matters whose distance is below `cut`, or equal to it with an index below `cut_index`, and whose index is below
 `limit`. The float32 at the address `numbers` are read from `first` on, the int32 at `indices` from `first_index` on.

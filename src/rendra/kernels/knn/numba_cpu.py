@@ -97,8 +97,10 @@ def nearest_sums(
     workers = num_threads()
     scratch = np.empty((workers, SCRATCH + 1), np.int64)
     _build(*clouds, *lengths, axes, first, second, workers)
-    looked_at = _match(*lengths, *weights, norm, (clouds[0].shape[1], clouds[1].shape[1]), _addresses(*first), _addresses(*second), match, sums, scratch,
-                       scratch.ctypes.data)  # fmt: skip
+    looked_at = _match(
+        *lengths, *weights, norm, (clouds[0].shape[1], clouds[1].shape[1]), _addresses(*first), _addresses(*second),
+        match, sums, scratch, scratch.ctypes.data,
+    )  # fmt: skip
     if any(grad.size for grad in grads):
         _pull_matched(*lengths, *weights, norm, first, second, match, *grads, workers)
     totals = sums.sum(2)

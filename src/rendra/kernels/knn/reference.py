@@ -1,8 +1,8 @@
 """Nearest points, the specification: plain torch, any device, any float type, slow.
 
-1. The distance of two points is the squared Euclidean one (norm 2) or the sum of absolute differences (norm 1). A pair
-   whose difference is not finite along some axis (NaN or infinite coordinates) is infinitely far apart and pulls at
-   nothing.
+1. The distance of two points is the squared Euclidean one (norm 2) or the sum of absolute differences (norm 1). A
+   pair whose difference is not finite along some axis (NaN or infinite coordinates) is infinitely far apart and
+   pulls at nothing.
 2. Of the candidates, those before `lengths2`, the K nearest count, nearest first; **of two equally near, the lower
    index comes first**.
 3. In a ball, of the candidates strictly closer than the radius, the K of lowest index count, lowest first.

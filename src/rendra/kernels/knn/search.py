@@ -1,8 +1,8 @@
 """The walk down a tree of boxes that collects the best candidates of one query.
 
-A candidate is one int64 key: for the nearest points its distance above its index, for points in a ball its index above
-its distance. Keys order as the rules of the reference ask, ties included, so that the result does not depend on the
-order of the walk. The K smallest are kept in a heap whose root is the largest.
+A candidate is one int64 key: for the nearest points its distance above its index, for points in a ball its index
+above its distance. Keys order as the rules of the reference ask, ties included, so that the result does not depend on
+the order of the walk. The K smallest are kept in a heap whose root is the largest.
 """
 
 from typing import NamedTuple
@@ -54,7 +54,7 @@ class Question(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """The scratch of one thread, by address, int64 each: the levels' first blocks, those visited, their masks; keys."""
+    """The scratch of one thread, int64, by address: the levels' first blocks, those visited, their masks; keys."""
 
     roots: int
     blocks: int
@@ -131,7 +131,7 @@ def collect(row, xyz, points, tree, levels, ask, bound, walk):
     """Put the smallest keys below `bound` into the heap, which the caller has filled, with EMPTY or candidates.
 
     `row` is the address of the query, of which the tree knows xyz, and `points` that of the candidates (*, D).
-    Returns the number of leaves that were looked at, and where in the leaves the last key that was kept stands, or -1.
+    Returns how many leaves were looked at, and where in the leaves the last key that was kept stands, or -1.
     """
     cut = _limits(read_int64(walk.heap, 0), bound, ask.radius)
     level, looked_at, slot, block = levels, 0, np.int64(-1), np.int64(0)

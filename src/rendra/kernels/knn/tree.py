@@ -6,8 +6,8 @@ runs are short or their points coincide: each time the box shrinks 256 times, so
 makes the tree bad or the work quadratic.
 
 A point with a coordinate that is not finite has all coordinates -infinity and stands at the end; as a query it has
-+infinity, so that no difference is NaN and each distance is infinite. The lanes of the last leaf and of the last block
-of a level that hold nothing are -infinity too, with the index NOTHING.
++infinity, so that no difference is NaN and each distance is infinite. The lanes of the last leaf and of the last
+block of a level that hold nothing are -infinity too, with the index NOTHING.
 """
 
 import math
