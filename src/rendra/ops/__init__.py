@@ -1,16 +1,20 @@
 """Operators on meshes, point clouds and grids."""
 
 from rendra.ops.ball_query import ball_query
+from rendra.ops.cubify import cubify
 from rendra.ops.graph_conv import GraphConv
 from rendra.ops.interp_face_attrs import interpolate_face_attributes
+from rendra.ops.iou_box3d import box3d_overlap
 from rendra.ops.knn import knn_gather, knn_points
 from rendra.ops.laplacian_matrices import cot_laplacian, laplacian, norm_laplacian
+from rendra.ops.marching_cubes import marching_cubes
 from rendra.ops.mesh_face_areas_normals import mesh_face_areas_normals
 from rendra.ops.mesh_filtering import taubin_smoothing
 from rendra.ops.packed_to_padded import packed_to_padded, padded_to_packed
 from rendra.ops.perspective_n_points import efficient_pnp
 from rendra.ops.points_alignment import corresponding_points_alignment, iterative_closest_point
 from rendra.ops.points_normals import estimate_pointcloud_local_coord_frames, estimate_pointcloud_normals
+from rendra.ops.sample_farthest_points import sample_farthest_points
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
 from rendra.ops.subdivide_meshes import SubdivideMeshes
 from rendra.ops.utils import (
@@ -26,9 +30,11 @@ __all__ = [
     "GraphConv",
     "SubdivideMeshes",
     "ball_query",
+    "box3d_overlap",
     "convert_pointclouds_to_tensor",
     "corresponding_points_alignment",
     "cot_laplacian",
+    "cubify",
     "efficient_pnp",
     "estimate_pointcloud_local_coord_frames",
     "estimate_pointcloud_normals",
@@ -40,10 +46,12 @@ __all__ = [
     "knn_gather",
     "knn_points",
     "laplacian",
+    "marching_cubes",
     "mesh_face_areas_normals",
     "norm_laplacian",
     "packed_to_padded",
     "padded_to_packed",
+    "sample_farthest_points",
     "sample_points_from_meshes",
     "taubin_smoothing",
     "vert_align",
