@@ -39,16 +39,20 @@ NAMES = {
     "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
     "rendra.io.ply_io": "MeshPlyFormat PointcloudPlyFormat load_ply save_ply",
     "rendra.ops": """
-        GraphConv SubdivideMeshes ball_query knn_gather knn_points convert_pointclouds_to_tensor corresponding_points_alignment cot_laplacian
-        efficient_pnp estimate_pointcloud_local_coord_frames estimate_pointcloud_normals eyes get_point_covariances
-        interpolate_face_attributes is_pointclouds iterative_closest_point laplacian mesh_face_areas_normals
-        norm_laplacian packed_to_padded padded_to_packed sample_points_from_meshes taubin_smoothing vert_align
-        wmean""",
+        GraphConv SubdivideMeshes ball_query box3d_overlap convert_pointclouds_to_tensor
+        corresponding_points_alignment cot_laplacian cubify efficient_pnp estimate_pointcloud_local_coord_frames
+        estimate_pointcloud_normals eyes get_point_covariances interpolate_face_attributes is_pointclouds
+        iterative_closest_point knn_gather knn_points laplacian marching_cubes mesh_face_areas_normals
+        norm_laplacian packed_to_padded padded_to_packed sample_farthest_points sample_points_from_meshes
+        taubin_smoothing vert_align wmean""",
+    "rendra.ops.cubify": "cubify",
     "rendra.ops.graph_conv": "GraphConv gather_scatter",
     "rendra.ops.ball_query": "ball_query",
     "rendra.ops.knn": "knn_gather knn_points",
     "rendra.ops.interp_face_attrs": "interpolate_face_attributes",
+    "rendra.ops.iou_box3d": "box3d_overlap",
     "rendra.ops.laplacian_matrices": "cot_laplacian laplacian norm_laplacian",
+    "rendra.ops.marching_cubes": "marching_cubes marching_cubes_naive",
     "rendra.ops.mesh_face_areas_normals": "mesh_face_areas_normals",
     "rendra.ops.mesh_filtering": "taubin_smoothing",
     "rendra.ops.packed_to_padded": "packed_to_padded padded_to_packed",
@@ -56,6 +60,7 @@ NAMES = {
     "rendra.ops.points_alignment": """
         ICPSolution SimilarityTransform corresponding_points_alignment iterative_closest_point""",
     "rendra.ops.points_normals": "estimate_pointcloud_local_coord_frames estimate_pointcloud_normals",
+    "rendra.ops.sample_farthest_points": "sample_farthest_points sample_farthest_points_naive",
     "rendra.ops.sample_points_from_meshes": "sample_points_from_meshes",
     "rendra.ops.subdivide_meshes": "SubdivideMeshes",
     "rendra.ops.utils": """
@@ -211,6 +216,10 @@ SIGNATURES = {
             texture_size, texture_wrap""",
     },
     "rendra.ops": {
+        "box3d_overlap": "boxes1, boxes2, eps=1e-4",
+        "cubify": "voxels, thresh, *, feats=None, device=None, align='topleft'",
+        "marching_cubes": "vol_batch, isolevel=None, return_local_coords=True",
+        "sample_farthest_points": "points, lengths=None, K=50, random_start_point=False",
         "corresponding_points_alignment": """X, Y, weights=None, estimate_scale=False, allow_reflection=False,
             eps=1e-9""",
         "efficient_pnp": "x, y, weights=None, skip_quadratic_eq=False",
