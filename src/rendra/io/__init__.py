@@ -1,4 +1,4 @@
-"""Mesh files: Wavefront OBJ with materials and textures, PLY, and formats of one's own."""
+"""Files of meshes and point clouds: OBJ, PLY, glTF, OFF, STL, XYZ, and formats of one's own."""
 
 from rendra.io.errors import MeshFormatError
 from rendra.io.obj_io import load_obj, load_objs_as_meshes, save_obj

@@ -165,5 +165,6 @@ def _packed(patches: list[_Patch], sampling: Sampling, name: str) -> tuple[Tenso
     ):
         warnings.warn(f"{name}: texture coordinates outside of [0, 1] are clamped to share one image", stacklevel=7)
     coordinates = [torch.from_numpy(uvs) for uvs in inside]
-    packed = pack_maps([patch.image for patch in patches], coordinates, sampling)
+    unpadded = [coordinates[0][:0]] * len(patches)  # as none lies outside
+    packed = pack_maps([patch.image for patch in patches], unpadded, sampling)
     return packed.image, [packed.move(i, uvs).numpy() for i, uvs in enumerate(coordinates)]

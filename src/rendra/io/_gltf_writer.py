@@ -203,6 +203,7 @@ def _savable(textures: TexturesBase | None) -> TexturesUV | TexturesVertex | Non
     if isinstance(textures, TexturesUV) and not textures.multi_map:
         image = textures.maps_list()[0]
         if image.dim() == 3 and image.shape[-1] == 3 and image.numel():
+            _warn_of_sampling(textures)
             return textures
     if textures is not None:
         what = f"this {type(textures).__name__}: it is not saved"
@@ -210,3 +211,11 @@ def _savable(textures: TexturesBase | None) -> TexturesUV | TexturesVertex | Non
             f"glTF files hold one RGB image with coordinates, or RGB vertex colours, not {what}", stacklevel=7
         )
     return None
+
+
+def _warn_of_sampling(textures: TexturesUV) -> None:
+    """Say what `read` will not know."""
+    if textures.padding_mode == "zeros":
+        warnings.warn('glTF cannot say padding_mode="zeros": the image is read with "border"', stacklevel=8)
+    if not textures.align_corners:
+        warnings.warn("align_corners=False is not saved: this package reads glTF with True", stacklevel=8)

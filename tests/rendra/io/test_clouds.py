@@ -6,11 +6,13 @@ import pytest
 import torch
 import trimesh
 from assertions import assert_close
+from far_device import far  # noqa: F401
 
 from rendra.io import IO, MeshFormatError
 from rendra.io._source import Source
 from rendra.io.xyz_io import parse_xyz
-from rendra.structures import Pointclouds
+from rendra.renderer.mesh.textures import TexturesUV, TexturesVertex
+from rendra.structures import Meshes, Pointclouds
 from rendra.utils.ico_sphere import ico_sphere
 
 UNIT = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [-1, 0.5, 2]]), dim=1)
@@ -150,6 +152,25 @@ def test_what_cannot_be_written(tmp_path):
         with pytest.raises(ValueError, match=r"'(points|verts)' is not finite"):
             IO().save_pointcloud(Pointclouds([POINTS * torch.nan]), tmp_path / f"c.{suffix}")
     assert (tmp_path / "c.xyz").read_bytes() == before
+
+
+def test_another_device(tmp_path, far):  # noqa: F811
+    """What lies there is written, and what is read goes there."""
+    sphere = ico_sphere(1)
+    uvs = TexturesUV(torch.rand(1, 4, 4, 3), sphere.faces_list(), [torch.rand(42, 2)])
+    mesh = Meshes(sphere.verts_list(), sphere.faces_list(), uvs).to(far)
+    colored = Meshes(mesh.verts_list(), mesh.faces_list(), TexturesVertex([mesh.verts_packed() * 0.1 + 0.5]))
+    for suffix, each in (("glb", mesh), ("gltf", mesh), ("glb", colored), ("off", colored)):
+        IO().save_mesh(each, tmp_path / f"m.{suffix}")
+        back = IO().load_mesh(tmp_path / f"m.{suffix}", device=far)
+        assert back.device == back.textures.device == far
+        assert back.verts_packed().tolist() == mesh.verts_packed().tolist()
+    IO().save_mesh(mesh, tmp_path / "m.stl", include_textures=False)
+    assert IO().load_mesh(tmp_path / "m.stl", device=far).device == far
+    cloud = CLOUDS["both"].to(far)
+    for suffix in ("xyz", "ply", "glb", "off"):
+        IO().save_pointcloud(cloud, tmp_path / f"c.{suffix}")
+        assert IO().load_pointcloud(tmp_path / f"c.{suffix}", device=far).device == far
 
 
 def test_trimesh_reads_what_is_written(tmp_path):

@@ -143,6 +143,16 @@ def test_what_gltf_cannot_hold(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [({"padding_mode": "zeros"}, "cannot say padding_mode"), ({"align_corners": False}, "not saved")],
+)
+def test_ways_to_read_a_texture_that_are_lost_are_said(tmp_path, options, why):
+    textures = TexturesUV(image_of(2, 2), [torch.tensor([[0, 1, 2]])], [torch.rand(3, 2)], **options)
+    with pytest.warns(UserWarning, match=why):
+        IO().save_mesh(Meshes([torch.eye(3)], [torch.tensor([[0, 1, 2]])], textures), tmp_path / "m.glb")
+
+
 def test_an_attribute_that_contradicts_the_file_is_ignored(tmp_path):
     """Other programs may move vertices and pass on attributes that they do not know."""
     builder = Builder()
