@@ -1,12 +1,12 @@
 """Intersection of boxes that stand in space at any angle.
 
-A convex solid is kept as a soup of directed edges: each face's edges form a ring, and each edge lies in two faces, once
-in either direction. Cutting such a soup with a plane needs no order: edges are shortened, in each face the gap is closed
-from where its ring leaves the half-space to where it comes back, and the closing edges, turned around, are the ring of
-the new face. Both copies of an edge are cut at the same numbers, to the bit, so that rings stay closed.
+A convex solid is kept as a soup of directed edges: each face's edges form a ring, and each edge lies in two faces,
+once in either direction. Cutting such a soup with a plane needs no order: edges are shortened, in each face the gap
+is closed from where its ring leaves the half-space to where it comes back, and the closing edges, turned around, are
+the ring of the new face. Both copies of an edge are cut at the same numbers, to the bit, so that rings stay closed.
 
-Letters: N and M boxes, P pairs of them, E edges of all pairs. A plane is (n, h): the points x with n.x = h, n of length
-one and outward. Everything is computed in float64.
+Letters: N and M boxes, P pairs of them, E edges of all pairs. A plane is (n, h): the points x with n.x = h, n outward
+and of length one. Everything is computed in float64.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ _FACES = ((0, 1, 2, 3), (3, 2, 6, 7), (0, 4, 5, 1), (0, 3, 7, 4), (1, 5, 6, 2), 
 def box3d_overlap(boxes1: Tensor, boxes2: Tensor, eps: float = 1e-4) -> tuple[Tensor, Tensor]:
     """Volume of the intersection of each box of one list with each of another, and intersection over union.
 
-    Exact for convex boxes with plane sides; they need not be rectangular. Not differentiable. Corners come in the order
+    Exact for convex boxes with plane sides, rectangular or not. Not differentiable. Corners come in the order
 
         (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)
 
@@ -107,7 +107,7 @@ def _may_meet(first: Tensor, planes1: _Planes, second: Tensor, planes2: _Planes)
 def _lowest(planes: _Planes, boxes: Tensor) -> Tensor:
     """How far the corners of each box at least lie outside each plane of others. (planes' boxes, boxes, 6)"""
     heights = planes.normal.reshape(-1, 3) @ boxes.reshape(-1, 3).T
-    return heights.view(-1, 6, len(boxes), 8).amin(-1).transpose(1, 2) - planes.height[:, None]
+    return heights.view(len(planes.height), 6, len(boxes), 8).amin(-1).transpose(1, 2) - planes.height[:, None]
 
 
 class _Soup(NamedTuple):

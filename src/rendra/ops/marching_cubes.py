@@ -18,8 +18,8 @@ def marching_cubes(
     counter-clockwise seen from there. For a density, higher inside, pass `-density` and `-isolevel`. The surface ends
     where the volume does; inside it has no holes, since faces share their vertices, also across ambiguous cubes.
 
-    The work is done by scikit-image on the CPU, wherever the volume lies (Lewiner et al., "Efficient implementation of
-    Marching Cubes' cases with topological guarantees", 2003); vertices are right to float32.
+    The work is done by scikit-image on the CPU, wherever the volume lies (Lewiner et al., "Efficient implementation
+    of Marching Cubes' cases with topological guarantees", 2003); vertices are right to float32.
 
     Args:
         vol_batch: (N, D, H, W), N volumes of finite values.

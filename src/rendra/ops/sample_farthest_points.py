@@ -79,9 +79,8 @@ def _numbers(points: Tensor, K: int | Sequence[int] | Tensor) -> Tensor:
     """How many points are wanted of each cloud. (N,)"""
     n = len(points)
     wanted = torch.as_tensor(K, device=points.device)
-    if wanted.is_floating_point() or wanted.dtype == torch.bool:
-        if wanted.numel():
-            raise ValueError(f"K must be whole numbers, got {wanted.dtype}")
+    if wanted.numel() and (wanted.is_floating_point() or wanted.dtype == torch.bool):
+        raise ValueError(f"K must be whole numbers, got {wanted.dtype}")
     wanted = wanted.to(torch.int64)
     wanted = wanted.expand(n) if wanted.ndim == 0 else wanted
     if wanted.shape != (n,):

@@ -11,7 +11,7 @@ __all__ = ["cubify"]
 def cubify(
     voxels: Tensor, thresh: float, x: Tensor, y: Tensor, z: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The faces between voxels that are kept, `voxels >= thresh`, and those that are not; `reference.py` has the rules.
+    """The faces between voxels that are kept, `voxels >= thresh`, and others; `reference.py` states each rule.
 
     Outside the grid nothing is kept, and neither is a NaN. The surface is closed and looks outwards. Not
     differentiable; the same on any number of threads.
@@ -24,9 +24,9 @@ def cubify(
         z: (D + 1,) the same along D.
 
     Returns:
-        verts (sum V, 3), their (x, y, z); faces (sum F, 3) int64, counting the vertices of their own grid; voxel_of_quad
-        (sum F / 2,) int64, index into `voxels.flatten()` of the voxel that faces 2i and 2i + 1 bound; num_verts (N,)
-        and num_faces (N,) int64.
+        verts (sum V, 3), their (x, y, z); faces (sum F, 3) int64, counting the vertices of their own grid;
+        voxel_of_quad (sum F / 2,) int64, index into `voxels.flatten()` of the voxel that faces 2i and 2i + 1 bound;
+        num_verts (N,) and num_faces (N,) int64.
 
     Raises:
         ValueError: a shape, type or device that cannot be.

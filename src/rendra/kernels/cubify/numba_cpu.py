@@ -16,7 +16,7 @@ _ROWS_AT_ONCE = 8  # rows of voxels that a thread packs together, so that it rea
 _BYTES_1, _BYTES_2 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
 _BYTES_4, _BYTES_8 = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
 _S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
-# The quad on each of a voxel's sides, by the voxel's corners; corner 4 dy + 2 dx + dz lies (dy, dx, dz) from the first.
+# The quad on each of a voxel's sides; corner 4 dy + 2 dx + dz of the voxel lies (dy, dx, dz) from its first.
 _SIDES = np.array([[0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6], [0, 4, 6, 2], [1, 3, 7, 5]])
 
 
@@ -32,8 +32,7 @@ def forward(
     _pack(voxels, np.float32(thresh), workers, occupied)
     _survey(occupied, workers, used, counts[0], counts[1])
     ends = np.cumsum(counts, axis=1)
-    per_grid = np.diff(ends.reshape(2, n, used[0].size if n else 0)[:, :, -1], prepend=0)
-    num_verts, num_quads = per_grid[0].copy(), per_grid[1].copy()
+    num_verts, num_quads = counts.reshape(2, n, (height + 1) * (width + 1) * words).sum(axis=2)
     verts = np.empty((num_verts.sum(), 3), np.float32)
     faces = np.empty((2 * num_quads.sum(), 3), np.int64)
     voxel_of_quad = np.empty(len(faces) // 2, np.int64)

@@ -37,7 +37,8 @@ def sample_farthest_points(points: Tensor, lengths: Tensor, num_samples: Tensor,
     for n, (length, number, first) in enumerate(known):
         if not 0 <= length <= points.shape[1] or number < 0 or not 0 <= first < max(length, 1):
             raise ValueError(
-                f"cloud {n} of {points.shape[1]} points cannot have length {length}, {number} samples and start {first}"
+                f"cloud {n} of {points.shape[1]} points cannot have length {length}, {number} samples and start "
+                f"{first}"
             )
     if points.device.type != "cpu" or points.dtype != torch.float32:
         return reference.sample_farthest_points(points.detach(), lengths, num_samples, start)

@@ -49,7 +49,7 @@ def _sample(cloud, length, number, first, picked):
     for d in range(dims):
         _sort_axis(cloud, d, order, starts, axes[d], lows[d], highs[d])
     nearest, squared, bounds = np.full(length, _INF), np.empty(length, np.float32), np.empty(buckets, np.float32)
-    farthest, farthest_index = np.full(buckets, _INF), np.zeros(buckets, np.int64)
+    farthest, farthest_index = np.full(buckets, _INF), order[starts[:-1]]
     # what is not negative compares as the integer of its bits does, and that is how the compiler vectorises a maximum
     nearest_bits, farthest_bits = nearest.view(np.int32), farthest.view(np.int32)
     here = np.int64(first)
