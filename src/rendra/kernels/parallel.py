@@ -63,10 +63,10 @@ def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         with _Process.lock:
             _Process.has_run = True
             numba.set_num_threads(num_threads())
-            known = len(compiled.signatures)
+            known = len(compiled.overloads)
             started = time.perf_counter()
             result = compiled(*arguments)
-            if len(compiled.signatures) > known and compiled.stats.cache_misses:
+            if len(compiled.overloads) > known and compiled.stats.cache_misses:
                 seconds = time.perf_counter() - started
                 _log.info("compiled kernel %s in %.1f s, once: it is cached now", _short_name(function), seconds)
         return result
