@@ -1,5 +1,6 @@
 """glTF files that lie: each gives a typed error that names the file, the place in it, and what was expected."""
 
+import copy
 import io
 import json
 import os
@@ -392,7 +393,7 @@ def test_fuzzed_documents(changes, cut):
         try:
             for key in way:
                 at = at[key]
-            at[last] = value
+            at[last] = copy.deepcopy(value)
         except (KeyError, IndexError, TypeError):
             continue  # an earlier change took this place away
     data = container(json.dumps(document).encode(), RICH.binary)
