@@ -16,7 +16,9 @@ from rendra.ops.points_alignment import corresponding_points_alignment, iterativ
 from rendra.ops.points_normals import estimate_pointcloud_local_coord_frames, estimate_pointcloud_normals
 from rendra.ops.sample_farthest_points import sample_farthest_points
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
+from rendra.ops.self_intersections import self_intersections
 from rendra.ops.subdivide_meshes import SubdivideMeshes
+from rendra.ops.surface_distance import SurfacePoints, distance_to_surface
 from rendra.ops.utils import (
     convert_pointclouds_to_tensor,
     eyes,
@@ -29,12 +31,14 @@ from rendra.ops.vert_align import vert_align
 __all__ = [
     "GraphConv",
     "SubdivideMeshes",
+    "SurfacePoints",
     "ball_query",
     "box3d_overlap",
     "convert_pointclouds_to_tensor",
     "corresponding_points_alignment",
     "cot_laplacian",
     "cubify",
+    "distance_to_surface",
     "efficient_pnp",
     "estimate_pointcloud_local_coord_frames",
     "estimate_pointcloud_normals",
@@ -53,6 +57,7 @@ __all__ = [
     "padded_to_packed",
     "sample_farthest_points",
     "sample_points_from_meshes",
+    "self_intersections",
     "taubin_smoothing",
     "vert_align",
     "wmean",
