@@ -208,7 +208,7 @@ def test_results_do_not_depend_on_threads():
 @pytest.mark.parametrize("queries", [*KINDS, "apart"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_work_stays_far_from_quadratic(queries, kind):
-    """Leaves that are looked at per query, of 313: a dozen at most, however the clouds lie."""
+    """Leaves that are looked at per query, of 313: thirty at most, however the clouds lie."""
     p1 = cloud("even", 2000, 1) + 100 if queries == "apart" else cloud(queries, 2000, 1)
     p2, axes = cloud(kind, 5000, 2), torch.arange(3).numpy()
     dists, idx = torch.zeros(1, 2000, 1), torch.full((1, 2000, 1), -1)
