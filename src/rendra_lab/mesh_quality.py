@@ -7,8 +7,8 @@ Geometry is computed in float64; lengths, areas and volumes are in units of the 
 Letters: V vertices, F faces, E edges; half-edge k of a face lies opposite to its vertex k.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ def mean_dihedral_deg(mesh: Meshes) -> Tensor:
     Returns:
         (), NaN where no two faces are adjacent.
     """
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     normals = _crosses(mesh)
     first, second = normals[sides.pairs[:, 0]], normals[sides.pairs[:, 1]]
     second = torch.where(sides.pairs_disagree[:, None], -second, second)
@@ -114,14 +114,14 @@ def unreferenced_verts(mesh: Meshes) -> Tensor:
 @torch.no_grad()
 def boundary_edges(mesh: Meshes) -> Tensor:
     """The edges with a face on one side only, as pairs of vertices. (B, 2)"""
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     return mesh.edges_packed()[sides.counts == 1]
 
 
 @torch.no_grad()
 def non_manifold_edges(mesh: Meshes) -> Tensor:
     """The edges where three or more faces meet, as pairs of vertices. (K, 2)"""
-    return mesh.edges_packed()[HalfEdges(mesh).counts > 2]
+    return mesh.edges_packed()[HalfEdges.of(mesh).counts > 2]
 
 
 @torch.no_grad()
@@ -130,11 +130,11 @@ def non_manifold_verts(mesh: Meshes) -> Tensor:
 
     The ends of non-manifold edges are not among them for that alone.
     """
-    sides = HalfEdges(mesh)
-    fan = sides.fans
+    sides = HalfEdges.of(mesh)
     owner = mesh.faces_packed()[sides.sound].reshape(-1)
-    fans = torch.unique(torch.stack([owner, fan[_spread(sides.sound)]], 1), dim=0)
-    fans_of = torch.bincount(fans[:, 0], minlength=len(mesh.verts_packed()))
+    owner_of_fan = torch.full((3 * len(mesh.faces_packed()),), -1, device=mesh.device)
+    owner_of_fan[sides.fans[_spread(sides.sound)]] = owner
+    fans_of = torch.bincount(owner_of_fan[owner_of_fan >= 0], minlength=len(mesh.verts_packed()))
     return (fans_of > 1).nonzero()[:, 0]
 
 
@@ -145,7 +145,7 @@ def boundary_loops(mesh: Meshes) -> Tensor:
     A boundary follows the faces through a vertex: patches that touch there have one each, two holes that touch
     there are one.
     """
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     half = sides.order[(sides.counts == 1)[sides.edge_of_sorted]]
     start, end = sides.corners(half)
     fan = sides.fans
@@ -183,7 +183,7 @@ def genus(mesh: Meshes) -> int | None:
 @torch.no_grad()
 def is_watertight(mesh: Meshes) -> bool:
     """Whether the mesh has faces, and every edge has two, which run through it in opposite directions."""
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     closed = bool(sides.sound.all()) and bool((sides.counts == 2).all())
     return closed and len(mesh.faces_packed()) > 0 and not bool(sides.pairs_disagree.any())
 
@@ -191,7 +191,7 @@ def is_watertight(mesh: Meshes) -> bool:
 @torch.no_grad()
 def inconsistent_edges(mesh: Meshes) -> Tensor:
     """The edges whose two faces are wound against each other, as pairs of vertices. (K, 2)"""
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     return mesh.edges_packed()[sides.counts == 2][sides.pairs_disagree]
 
 
@@ -201,7 +201,7 @@ def flipped_faces(mesh: Meshes) -> Tensor:
 
     A patch that cannot be oriented, such as a Moebius strip, has no flipped faces.
     """
-    sides, num_faces = HalfEdges(mesh), len(mesh.faces_packed())
+    sides, num_faces = HalfEdges.of(mesh), len(mesh.faces_packed())
     first, second = sides.pairs.unbind(1)
     turned = sides.pairs_disagree.long() * num_faces
     # every face twice, once as it is and once turned round; neighbours that agree are linked
@@ -254,33 +254,43 @@ def wrong_normals(mesh: Meshes) -> Tensor:
 def merge_verts(mesh: Meshes) -> Meshes:
     """One mesh with vertices at exactly the same place made one; without textures and normals."""
     verts = mesh.verts_packed().detach() + 0.0
-    _, numbers = torch.unique(verts, dim=0, return_inverse=True)
-    kept = torch.zeros(int(numbers.amax()) + 1 if len(numbers) else 0, 3, dtype=verts.dtype, device=verts.device)
-    kept[numbers] = verts
+    order, repeats = _sorted_rows(verts)
+    numbers = torch.empty_like(order)
+    numbers[order] = (~repeats).cumsum(0) - 1
+    kept = verts[order[~repeats]]
     return Meshes([kept], [numbers[mesh.faces_packed()]])
 
 
-@dataclass(frozen=True)
 class HalfEdges:
     """The sides of a mesh's faces, sorted by the edge that they lie on.
 
-    Attributes:
+    Args:
         mesh: whose.
     """
 
-    mesh: Meshes
+    def __init__(self, mesh: Meshes) -> None:
+        self._faces = mesh.faces_packed()
+        self._num_edges = len(mesh.edges_packed())
+        self._faces_to_edges = mesh.faces_packed_to_edges_packed()
+
+    @staticmethod
+    def of(mesh: Meshes) -> "HalfEdges":
+        """Those of a mesh, sorted only once for all functions of this module."""
+        if mesh not in _SORTED:
+            _SORTED[mesh] = HalfEdges(mesh)
+        return _SORTED[mesh]
 
     @cached_property
     def sound(self) -> Tensor:
         """Which faces name three different vertices. (F,) bool"""
-        v0, v1, v2 = self.mesh.faces_packed().unbind(1)
+        v0, v1, v2 = self._faces.unbind(1)
         return (v0 != v1) & (v1 != v2) & (v2 != v0)
 
     @cached_property
     def _edges(self) -> Tensor:
         """The edge of each half-edge; one too many for those of faces that are not sound. (3 F,)"""
-        edges = self.mesh.faces_packed_to_edges_packed()
-        return torch.where(self.sound[:, None], edges, len(self.mesh.edges_packed())).reshape(-1)
+        edges = self._faces_to_edges
+        return torch.where(self.sound[:, None], edges, self._num_edges).reshape(-1)
 
     @cached_property
     def order(self) -> Tensor:
@@ -296,7 +306,7 @@ class HalfEdges:
     @cached_property
     def counts(self) -> Tensor:
         """How many sound faces each edge has. (E,)"""
-        return torch.bincount(self.edge_of_sorted, minlength=len(self.mesh.edges_packed()))
+        return torch.bincount(self.edge_of_sorted, minlength=self._num_edges)
 
     def corners(self, half: Tensor) -> tuple[Tensor, Tensor]:
         """The corners 3 f + k where half-edges start and end."""
@@ -316,19 +326,22 @@ class HalfEdges:
     @cached_property
     def pairs_disagree(self) -> Tensor:
         """Whether the two faces run through their edge in the same direction. (P,) bool"""
-        owner = self.mesh.faces_packed().reshape(-1)
+        owner = self._faces.reshape(-1)
         starts = owner[self.corners(self._two)[0]]
         return starts[:, 0] == starts[:, 1]
 
     @cached_property
     def fans(self) -> Tensor:
         """A number for each corner 3 f + k; those of one fan of faces round a vertex have the same. (3 F,)"""
-        owner = self.mesh.faces_packed().reshape(-1)
+        owner = self._faces.reshape(-1)
         same = (self.edge_of_sorted[1:] == self.edge_of_sorted[:-1]).nonzero()[:, 0]
         start, end = self.corners(self.order)
         turned = (owner[start] > owner[end])[:, None]
         ends = torch.where(turned, torch.stack([end, start], 1), torch.stack([start, end], 1))  # low, high vertex
         return _components(len(owner), ends[same].reshape(-1), ends[same + 1].reshape(-1))
+
+
+_SORTED: WeakKeyDictionary[Meshes, HalfEdges] = WeakKeyDictionary()
 
 
 def _crosses(mesh: Meshes) -> Tensor:
@@ -344,15 +357,24 @@ def _volumes(mesh: Meshes) -> Tensor:
     return (v0 * torch.linalg.cross(v1, v2)).sum(1) / 6
 
 
+def _sorted_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The numbers of the rows of a table in an order that keeps equal ones together, the first first. (R,)
+
+    And which rows in that order equal the one before. (R,) bool
+    """
+    table = rows.cpu().numpy()
+    order = np.lexsort(table.T) if len(table) else np.zeros(0, _NUMBERED)
+    repeats = np.zeros(len(table), dtype=bool)
+    repeats[1:] = (table[order[1:]] == table[order[:-1]]).all(1)
+    return torch.from_numpy(order).to(rows.device), torch.from_numpy(repeats).to(rows.device)
+
+
 def _repeats(rows: Tensor) -> Tensor:
     """Which rows are equal to an earlier one. (R,) bool"""
-    if not len(rows):
-        return torch.zeros(0, dtype=torch.bool, device=rows.device)
-    table = rows.cpu().numpy()
-    order = np.lexsort(table.T)  # stable: of equal rows the first comes first
-    repeated = np.zeros(len(table), dtype=bool)
-    repeated[order[1:]] = (table[order[1:]] == table[order[:-1]]).all(1)
-    return torch.from_numpy(repeated).to(rows.device)
+    order, repeats = _sorted_rows(rows)
+    result = torch.empty_like(repeats)
+    result[order] = repeats
+    return result
 
 
 def _components(num_nodes: int, source: Tensor, target: Tensor) -> Tensor:
@@ -370,7 +392,7 @@ def _spread(mask: Tensor) -> Tensor:
 
 def _closed_components(mesh: Meshes, labels: Tensor) -> Tensor:
     """Which components have two faces that agree at each edge. (C,) bool"""
-    sides = HalfEdges(mesh)
+    sides = HalfEdges.of(mesh)
     closed = torch.ones(int(labels.amax()) + 1, dtype=torch.bool, device=labels.device)
     bad_faces = sides.order.div(3, rounding_mode="floor")[(sides.counts != 2)[sides.edge_of_sorted]]
     closed[labels[bad_faces]] = False
