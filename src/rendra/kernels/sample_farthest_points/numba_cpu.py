@@ -76,20 +76,27 @@ def _cut(cloud, length, largest):
 
     What holds more than `largest` points is halved at the middle of the longest side of its box.
     """
-    order, spare = np.arange(length), np.empty(length, np.int64)
-    starts, ends = [np.int64(0)], [np.int64(length)]  # ends: of what still has to be cut, the nearest one last
-    while len(ends) > 0:
-        begin, end = starts[-1], ends[-1]
+    order, spare = np.empty(length, np.int64), np.empty(length, np.int64)
+    for i in range(length):
+        order[i] = i
+    starts, ends = np.empty(length + 1, np.int64), np.empty(length, np.int64)
+    buckets, waiting = 0, 1  # ends: of what still has to be cut, the nearest one last
+    starts[0], ends[0] = 0, length
+    while waiting > 0:
+        begin, end = starts[buckets], ends[waiting - 1]
         axis, low, high = 0, _ZERO, _ZERO
         if end - begin > largest:
             axis, low, high = _longest_side(cloud, order, begin, end)
         if low == high:
-            starts.append(ends.pop())
+            waiting -= 1
+            buckets += 1
+            starts[buckets] = end
         else:
             middle = _HALF * low + _HALF * high
             middle = low if middle >= high else middle
-            ends.append(_part(cloud, axis, middle, order, spare, begin, end))
-    return order, np.array(starts)
+            ends[waiting] = _part(cloud, axis, middle, order, spare, begin, end)
+            waiting += 1
+    return order, starts[: buckets + 1]
 
 
 @scalar_kernel
@@ -118,7 +125,8 @@ def _part(cloud, axis, middle, order, spare, begin, end):
         else:
             spare[moved] = index
             moved += 1
-    order[kept:end] = spare[:moved]
+    for i in range(moved):
+        order[kept + i] = spare[i]
     return kept
 
 
