@@ -36,7 +36,7 @@ EXTRAS = {
         "parallel sweeps and searches",
         ("hydra-joblib-launcher", "hydra-submitit-launcher", "hydra-optuna-sweeper"),
     ),
-    "view": ("MP4 files and a live viewer", ("av", "viser")),
+    "view": ("MP4 files, figures in a browser, a live viewer", ("av", "viser", "plotly")),
     "dev": ("tests and checks", ("pytest", "ruff", "mypy", "import-linter")),
 }
 Row = tuple[str, str, str]  # what, found, advice
