@@ -66,11 +66,16 @@ NAMES = {
     "rendra.ops.utils": """
         convert_pointclouds_to_tensor eyes get_point_covariances is_pointclouds masked_gather wmean""",
     "rendra.ops.vert_align": "vert_align",
-    "rendra.loss": "chamfer_distance mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency",
+    "rendra.loss": """
+        chamfer_distance mesh_edge_loss mesh_laplacian_smoothing mesh_normal_consistency point_mesh_edge_distance
+        point_mesh_face_distance""",
     "rendra.loss.chamfer": "chamfer_distance",
     "rendra.loss.mesh_edge_loss": "mesh_edge_loss",
     "rendra.loss.mesh_laplacian_smoothing": "mesh_laplacian_smoothing",
     "rendra.loss.mesh_normal_consistency": "mesh_normal_consistency",
+    "rendra.loss.point_mesh_distance": """
+        edge_point_distance face_point_distance point_edge_distance point_face_distance point_mesh_edge_distance
+        point_mesh_face_distance""",
     "rendra.utils": "cameras_from_opencv_projection ico_sphere opencv_from_cameras_projection torus",
     "rendra.utils.camera_conversions": "cameras_from_opencv_projection opencv_from_cameras_projection",
     "rendra.utils.ico_sphere": "ico_sphere",
@@ -264,6 +269,16 @@ SIGNATURES = {
     "rendra.loss.mesh_edge_loss": {"mesh_edge_loss": "meshes, target_length=0.0"},
     "rendra.loss.mesh_laplacian_smoothing": {"mesh_laplacian_smoothing": "meshes, method='uniform'"},
     "rendra.loss.mesh_normal_consistency": {"mesh_normal_consistency": "meshes"},
+    "rendra.loss.point_mesh_distance": {
+        "point_mesh_face_distance": "meshes, pcls, min_triangle_area=5e-3",
+        "point_mesh_edge_distance": "meshes, pcls",
+        "point_face_distance": """points, points_first_idx, tris, tris_first_idx, max_points,
+            min_triangle_area=5e-3""",
+        "face_point_distance": """points, points_first_idx, tris, tris_first_idx, max_tris,
+            min_triangle_area=5e-3""",
+        "point_edge_distance": "points, points_first_idx, segms, segms_first_idx, max_points",
+        "edge_point_distance": "points, points_first_idx, segms, segms_first_idx, max_segms",
+    },
     "rendra.utils": {
         "ico_sphere": "level=0, device=None",
         "torus": "r, R, sides, rings, device=None",

@@ -84,7 +84,7 @@ def _check(points: Tensor, points_first: Tensor, tris: Tensor, tris_first: Tenso
 
 def _check_segments(name: str, first: list[int], total: int) -> None:
     """Segments must follow each other from 0 on, and hold everything."""
-    ends = [*first[1:], total]
+    ends = [*first, total][1:]
     if (first[0] if first else total) != 0 or any(a > b for a, b in zip(first, ends, strict=True)):
         raise ValueError(
             f"first_idx of the {total} {name} must start at 0 and never fall or pass the end, got {first}"

@@ -2,7 +2,7 @@
 
 Forward: queries, sorted along a Morton curve, walk a box tree over the targets of their segment, nearest box first;
 eight triangles or points are measured at a time. Each query starts from the result of the one before it.
-Backward: pairs are sorted by target, and every target gathers from its own, so that nothing races.
+Backward: one thread adds the pairs in their order, a hundredth of the forward pass; so nothing races.
 """
 
 import math
@@ -19,8 +19,9 @@ ONE = np.float32(1.0)
 TWO = np.float32(2.0)
 HALF = np.float32(0.5)
 QUARTER = np.float32(0.25)
-TINY = np.float32(1e-37)  # least square of a length or an area that is divided by
+TINY = np.float32(1e-37)  # least square of a length or an area that is not zero
 INFINITY = np.float32(np.inf)
+NAN = np.float32(np.nan)
 SLACK = np.float32(1e-6)  # bounds rounding: of a distance, and of an edge as long as the segment's diagonal
 
 _QUERIES_AT_ONCE = 64
@@ -57,18 +58,8 @@ def backward(
     points: np.ndarray, tris: np.ndarray, by_point: bool, index: np.ndarray, weights: np.ndarray, upstream: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradients of points (P, 3) and faces (F, 3, 3); `by_point` tells whose index, weights and upstream it is."""
-    workers = num_threads()
-    everything, arms = np.arange(len(index)), np.empty((len(index), 3), np.float32)
-    point_of, face_of = (everything, index) if by_point else (index, everything)
-    _scaled_arms(points, tris, point_of, face_of, index, weights, upstream, workers, arms)
-    starts, pairs = _pairs_by_target(index, len(tris) if by_point else len(points))
-    grad_tris = np.empty_like(tris)
-    if by_point:
-        _gather_faces(starts, pairs, arms, weights, workers, grad_tris)
-        return arms, grad_tris
-    grad_points = np.empty_like(points)
-    _gather_points(starts, pairs, arms, workers, grad_points)
-    _gather_faces(np.arange(len(tris) + 1), everything, arms, weights, workers, grad_tris)
+    grad_points, grad_tris = np.zeros_like(points), np.zeros_like(tris)
+    _scatter(points, tris, by_point, index, weights, upstream, grad_points, grad_tris)
     return grad_points, grad_tris
 
 
@@ -161,7 +152,7 @@ def _measure_leaf(query, leaf, least_square, out):
 def _limit(best, diag):
     """Squared distance of the boxes that may still hold a nearer item, or an equal one, for all the rounding."""
     reach = math.sqrt(best) * (ONE + SLACK) + SLACK * diag
-    return reach * reach
+    return reach * reach + TINY  # never zero: an equal one must be below it
 
 
 @scalar_kernel
@@ -188,22 +179,20 @@ def _walk(queries, order, owner, targets, boxes, children, roots, leaves, ids, l
                 if owner[i] != segment:
                     segment, nearest = owner[i], -1
                     diag = diagonal(boxes[roots[segment]]) if roots[segment] >= 0 else ZERO
-                if roots[segment] < 0:
-                    squared[i], index[i], weights[i] = ZERO, -1, ZERO
-                    continue
-                squared[i], index[i], weights[i] = np.float32(np.nan), -1, ZERO
-                if not is_finite(queries[i]):
-                    continue
-                _bound(queries[i], low, high)
-                nearest = _nearest_of_one(
-                    queries[i], low, high, diag, targets, nearest, boxes, children, roots[segment], leaves, ids,
-                    least_square, bounds, stack, keys,
-                )  # fmt: skip
-                index[i] = nearest
-                if nearest >= 0:
-                    squared[i], weights[i, 0], weights[i, 1], weights[i, 2] = _foot_of_pair(
-                        queries[i], targets[nearest], least_square
-                    )
+                if roots[segment] >= 0 and is_finite(queries[i]):
+                    _bound(queries[i], low, high)
+                    nearest = _nearest_of_one(
+                        queries[i], low, high, diag, targets, nearest, boxes, children, roots[segment], leaves, ids,
+                        least_square, bounds, stack, keys,
+                    )  # fmt: skip
+                    found = nearest
+                else:
+                    found = -1
+                index[i] = found
+                d, w0, w1, w2 = NAN if roots[segment] >= 0 else ZERO, ZERO, ZERO, ZERO
+                if found >= 0:
+                    d, w0, w1, w2 = _foot_of_pair(queries[i], targets[found], least_square)
+                squared[i], weights[i, 0], weights[i, 1], weights[i, 2] = d, w0, w1, w2
 
 
 @scalar_kernel
@@ -240,54 +229,17 @@ def _nearest_of_one(query, low, high, diag, targets, guess, boxes, children, roo
     return nearest
 
 
-@parallel_kernel
-def _scaled_arms(points, tris, point_of, face_of, index, weights, upstream, workers, arms):
-    """What every pair asks of its point: 2 g r."""
-    for worker in prange(workers):
-        for k in range(worker * len(index) // workers, (worker + 1) * len(index) // workers):
-            arms[k] = ZERO
-            if index[k] >= 0:
-                gain = TWO * upstream[k]
-                x, y, z = arm(points[point_of[k]], tris[face_of[k]], weights[k, 0], weights[k, 1], weights[k, 2])
-                arms[k, 0], arms[k, 1], arms[k, 2] = gain * x, gain * y, gain * z
-
-
 @scalar_kernel
-def _pairs_by_target(index, num_targets):
-    """The pairs of every target, in their order: (starts (T + 1,), pairs (K,)); -1 belongs to none."""
-    starts = np.zeros(num_targets + 1, np.int64)
+def _scatter(points, tris, by_point, index, weights, upstream, grad_points, grad_tris):
+    """Add what every pair asks, in their order: 2 g r of its point, and -w_i 2 g r of the corners of its face."""
     for k in range(len(index)):
         if index[k] >= 0:
-            starts[index[k] + 1] += 1
-    for t in range(num_targets):
-        starts[t + 1] += starts[t]
-    cursor = starts[:-1].copy()
-    pairs = np.empty(starts[-1], np.int64)
-    for k in range(len(index)):
-        if index[k] >= 0:
-            pairs[cursor[index[k]]] = k
-            cursor[index[k]] += 1
-    return starts, pairs
-
-
-@parallel_kernel
-def _gather_faces(starts, pairs, arms, weights, workers, grad):
-    """What all pairs of a face ask of its corners: -w_i 2 g r."""
-    for worker in prange(workers):
-        for f in range(worker * len(grad) // workers, (worker + 1) * len(grad) // workers):
-            grad[f] = ZERO
-            for entry in range(starts[f], starts[f + 1]):
-                k = pairs[entry]
-                for c in range(3):
-                    for axis in range(3):
-                        grad[f, c, axis] -= weights[k, c] * arms[k, axis]
-
-
-@parallel_kernel
-def _gather_points(starts, pairs, arms, workers, grad):
-    for worker in prange(workers):
-        for p in range(worker * len(grad) // workers, (worker + 1) * len(grad) // workers):
-            grad[p] = ZERO
-            for entry in range(starts[p], starts[p + 1]):
-                for axis in range(3):
-                    grad[p, axis] += arms[pairs[entry], axis]
+            p, f = (k, index[k]) if by_point else (index[k], k)
+            w0, w1, w2 = weights[k, 0], weights[k, 1], weights[k, 2]
+            r = arm(points[p], tris[f], w0, w1, w2)
+            for axis in range(3):
+                pull = TWO * upstream[k] * r[axis]
+                grad_points[p, axis] += pull
+                grad_tris[f, 0, axis] -= w0 * pull
+                grad_tris[f, 1, axis] -= w1 * pull
+                grad_tris[f, 2, axis] -= w2 * pull

@@ -52,8 +52,8 @@ def _search(
     """Index (Q,) of each query's nearest target in its own segment, -1 if none; and which have no target at all."""
     index = queries_first.new_full((len(queries),), -1)
     is_alone = torch.ones_like(index, dtype=torch.bool)
-    query_ends = [*queries_first.tolist()[1:], len(queries)]
-    target_ends = [*targets_first.tolist()[1:], len(targets)]
+    query_ends = [*queries_first.tolist(), len(queries)][1:]
+    target_ends = [*targets_first.tolist(), len(targets)][1:]
     segments = zip(queries_first.tolist(), query_ends, targets_first.tolist(), target_ends, strict=True)
     for query, query_end, target, target_end in segments:
         if target == target_end:
