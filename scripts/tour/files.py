@@ -57,7 +57,6 @@ def main(file: str | None = None) -> None:
         for name, colours in (properties.material_colors or {}).items():
             print(f"material {name}:", {key: rounded(value) for key, value in colours.items()})
         print("texture images:", list(properties.texture_images or {}) or "none")
-
         save_obj(Path(folder) / "copy.obj", verts, faces.verts_idx)
         again, _, _ = load_obj(Path(folder) / "copy.obj")
         print(f"written as OBJ and read again: same={torch.equal(again, verts)}")

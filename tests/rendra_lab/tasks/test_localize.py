@@ -50,13 +50,13 @@ def test_solids_are_closed_convex_and_the_right_way_out(name, counts):
 
 def test_subdivision_keeps_the_surface():
     mesh = SOLIDS["dodecahedron"]()
-    finer = subdivided(mesh, 2)
+    finer = subdivided(mesh, 200)
     assert len(finer.faces_packed()) == 16 * len(mesh.faces_packed())
     assert_close(finer.faces_areas_packed().sum(), mesh.faces_areas_packed().sum())
 
 
 def test_a_look_is_displaced_and_disturbed_as_told():
-    data = seen(displacement=(1.0, -2.0, 3.0), noise_variance=0.25, detail=4)
+    data = seen(displacement=(1.0, -2.0, 3.0), noise_variance=0.25, measurements=2000)
     assert data.seen.num_verts_per_mesh().unique().numel() == 3  # meshes of different sizes in one batch
     offset = data.seen.verts_packed() - data.known.verts_packed()
     assert_close(offset.mean(0), torch.tensor([1.0, -2.0, 3.0]), atol=0.03, rtol=0)
@@ -99,7 +99,7 @@ def test_meshes_of_files(compose, tmp_path):
     files = f"data.paths=[{','.join(str(path) for path in paths)}]"
     exports = "callbacks.meshes.formats=[ply]"
     small = [each for each in SMALL if each != "callbacks.meshes=null"]
-    error = run(compose(folder, *small, files, exports, "data.detail=1", "data.noise_variance=1e-4"))
+    error = run(compose(folder, *small, files, exports, "data.measurements=50", "data.noise_variance=1e-4"))
     assert error < 0.1
     moved = IO().load_mesh(folder / "exports" / "b.ply").verts_packed()
     assert_close(moved.mean(0), torch.tensor([3.0, 4.0, 5.0]), atol=0.1, rtol=0)
@@ -110,7 +110,7 @@ def test_files_of_one_name_stay_apart(tmp_path):
     for folder in ("first", "second"):
         (tmp_path / folder).mkdir()
         IO().save_mesh(SOLIDS["cube"](), tmp_path / folder / "scan.ply")
-    data = seen(paths=[tmp_path / "first" / "scan.ply", tmp_path / "second" / "scan.ply"], samples=10, detail=0)
+    data = seen(paths=[tmp_path / "first" / "scan.ply", tmp_path / "second" / "scan.ply"], samples=10, measurements=0)
     assert data.look(0).titles == ["scan_0", "scan_1"]
 
 
@@ -122,9 +122,9 @@ def test_files_of_one_name_stay_apart(tmp_path):
             r"data.displacement must be three numbers such as \[3,4,5\], got \[1.0, 2.0\]",
         ),
         ({"displacement": (1.0, 2.0, float("nan"))}, "data.displacement must be three numbers"),
-        ({"noise_variance": -1.0}, "data.noise_variance must be at least 0, got -1.0"),
-        ({"detail": -1}, "data.detail must be at least 0"),
-        ({"samples": 0}, "data.samples must be at least 1"),
+        ({"noise_variance": -1.0}, r"data.noise_variance must lie between 0 and 1e\+12, got -1.0"),
+        ({"measurements": -1}, r"data.measurements must lie between 0 and 1e\+06, got -1"),
+        ({"samples": 0}, "data.samples must lie between 1"),
         ({"paths": "cow.obj"}, "data.paths must be a list of files"),
         ({"paths": []}, "data.paths must be a list of files"),
     ],

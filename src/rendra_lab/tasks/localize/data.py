@@ -66,8 +66,8 @@ class SeenSolids(LightningDataModule):
             dodecahedron whose corners lie sqrt(3) from the origin.
         displacement: of what is seen, in the units of the meshes.
         noise_variance: of every coordinate of every vertex that is seen, in squared units.
-        detail: how often each triangle is cut into four before its vertices are disturbed: the finer, the more
-            measurements there are for the noise to cancel in.
+        measurements: vertices that each mesh has at least when they are disturbed; triangles are cut into four until
+            there are so many. The more, the better the noise cancels.
         samples: points S drawn from each mesh at every look.
         seed: of the noise and of the points.
         steps: looks an epoch.
@@ -83,19 +83,19 @@ class SeenSolids(LightningDataModule):
         paths: Sequence[str | Path] | None = None,
         displacement: Sequence[float] = (3.0, 4.0, 5.0),
         noise_variance: float = 0.1,
-        detail: int = 3,
+        measurements: int = 1000,
         samples: int = 5000,
         seed: int = 0,
         steps: int = 100_000,
     ) -> None:
         super().__init__()
-        _check_settings(displacement, noise_variance, detail, samples)
+        _check_settings(displacement, noise_variance, measurements, samples)
         if isinstance(paths, (str, Path)) or (paths is not None and not paths):
             raise UserError(f"data.paths must be a list of files such as [a.obj,b.ply], or null, got {paths!r}")
         self.paths = None if paths is None else [Path(path) for path in paths]
         self.displacement = torch.tensor([[float(each) for each in displacement]])
         self.noise_variance = noise_variance
-        self.detail = detail
+        self.measurements = measurements
         self.samples = samples
         self.seed = seed
         self.steps = steps
@@ -108,7 +108,9 @@ class SeenSolids(LightningDataModule):
             self.titles, meshes = list(SOLIDS), [make() for make in SOLIDS.values()]
         else:
             self.titles, meshes = _distinct([path.stem for path in self.paths]), [_read(path) for path in self.paths]
-        self.known = join_meshes_as_batch([subdivided(mesh, self.detail) for mesh in meshes], include_textures=False)
+        self.known = join_meshes_as_batch(
+            [subdivided(mesh, self.measurements) for mesh in meshes], include_textures=False
+        )
         verts = self.known.verts_packed()
         noise = torch.randn(verts.shape, generator=torch.Generator().manual_seed(self.seed))
         self.seen = self.known.offset_verts(math.sqrt(self.noise_variance) * noise + self.displacement)
@@ -131,12 +133,16 @@ class SeenSolids(LightningDataModule):
         return 0 if self.trainer is None else self.trainer.global_step
 
 
-def _check_settings(displacement: Sequence[float], noise_variance: float, detail: int, samples: int) -> None:
+def _check_settings(displacement: Sequence[float], noise_variance: float, measurements: int, samples: int) -> None:
     if len(displacement) != 3 or not all(math.isfinite(each) for each in displacement):
         raise UserError(f"data.displacement must be three numbers such as [3,4,5], got {list(displacement)}")
-    for key, value, least in (("noise_variance", noise_variance, 0), ("detail", detail, 0), ("samples", samples, 1)):
-        if not least <= value < math.inf:
-            raise UserError(f"data.{key} must be at least {least}, got {value}")
+    for key, value, least, most in (
+        ("noise_variance", noise_variance, 0, 1e12),
+        ("measurements", measurements, 0, 1_000_000),
+        ("samples", samples, 1, 1_000_000),
+    ):
+        if not least <= value <= most:
+            raise UserError(f"data.{key} must lie between {least} and {most:.0e}, got {value}")
 
 
 def _read(path: Path) -> Meshes:

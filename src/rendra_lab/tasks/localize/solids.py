@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import cast
 
 import numpy as np
 import torch
@@ -34,11 +35,11 @@ def dodecahedron() -> Meshes:
 SOLIDS = {"cube": cube, "octahedron": octahedron, "dodecahedron": dodecahedron}
 
 
-def subdivided(mesh: Meshes, times: int) -> Meshes:
-    """The same surface of 4^times as many triangles."""
+def subdivided(mesh: Meshes, num_verts: int) -> Meshes:
+    """The same surface, every triangle cut into four until there are at least `num_verts` vertices."""
     subdivide = SubdivideMeshes()
-    for _ in range(times):
-        mesh = subdivide(mesh)
+    while len(mesh.verts_packed()) < num_verts:
+        mesh = cast(Meshes, subdivide(mesh))
     return mesh
 
 
