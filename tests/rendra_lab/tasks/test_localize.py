@@ -1,18 +1,23 @@
 """The displacement of a depth camera, composed and run as a user runs it, small."""
 
 import json
+from functools import partial
 
 import pytest
 import torch
 from assertions import assert_close
+from far_device import Far, far  # noqa: F401
 
 from rendra.io import IO
+from rendra_lab import losses, visualization
 from rendra_lab.errors import UserError
 from rendra_lab.experiment import run
 from rendra_lab.tasks.localize.data import Looks, SeenSolids
 from rendra_lab.tasks.localize.scores import displacement_error, estimated_coordinate, true_coordinate
 from rendra_lab.tasks.localize.solids import SOLIDS, subdivided
+from rendra_lab.tasks.localize.task import Localize
 from rendra_lab.tasks.localize.views import picture
+from rendra_lab.terms import LossTerm, MetricTerm
 
 SMALL = (
     "task=localize",
@@ -165,3 +170,23 @@ def test_a_picture_shows_what_is_seen_and_the_estimate_apart_then_together():
         assert orange.any()
     columns = [(image[..., 0] > image[..., 2] + 0.1).any(0).nonzero().float().mean() for image in (apart, together)]
     assert (columns[0] - columns[1]).abs() > 50  # pixels
+
+
+def test_a_fit_stays_where_its_batch_lies(far):  # noqa: F811
+    batch = seen(samples=20, measurements=0).look(0).to(far)
+    task = Localize(
+        losses={"chamfer": LossTerm(losses.chamfer, 1.0, "samples", "points")},
+        metrics={"error": MetricTerm(displacement_error, "displacement", "displacement")},
+        optimizer=partial(torch.optim.SGD, lr=0.25),
+    )
+    task.displacement = torch.nn.Parameter(task.displacement.detach().to(far))
+    prediction = task.predict(batch)
+    task.objective(prediction, batch)[0].backward()
+    assert isinstance(task.displacement.grad, Far)
+    assert isinstance(task.score(prediction, batch)["error"], Far)
+    with torch.no_grad():
+        assert [visualization.to_picture(image).shape for image in task.panels(prediction, batch).values()] == [
+            (300, 300, 3)
+        ] * 3
+        assert list(task.meshes(prediction, batch)) == list(SOLIDS)
+        assert task.facts(prediction, batch)["displacement"]["truth"] == [3.0, 4.0, 5.0]
