@@ -66,7 +66,7 @@ def prepare(options: argparse.Namespace) -> Any:
     """The scene, but for its folder."""
     import torch
 
-    from rendra_lab.benchmarks import Scene
+    from rendra_lab.benchmarks.scene import Scene
     from rendra_lab.data.meshes import load_mesh
 
     if options.threads is not None:
@@ -82,7 +82,7 @@ def prepare(options: argparse.Namespace) -> Any:
 def tools(skip_tests: bool) -> tuple[Any, Any, Any]:
     """Our library, PyTorch3D or None, and what runs the tests or None."""
     from rendra_lab.benchmarking import Proofs
-    from rendra_lab.benchmarks import Library
+    from rendra_lab.benchmarks.scene import Library
 
     try:
         rival = Library("pytorch3d")

@@ -6,6 +6,7 @@ import statistics
 import sys
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -282,16 +283,18 @@ class AnimationWriter(Callback):
 
 
 class MeshLogger(Callback):
-    """Shows the meshes of a task in TensorBoard at intervals, and leaves the final ones as PLY files.
+    """Shows the meshes of a task in TensorBoard at intervals, and leaves the final ones as files.
 
     Args:
         folder: of the files.
         every_n_steps: interval during the fit; 0 shows the end alone.
+        formats: of the files, each an ending that `rendra.io.IO` writes, such as ply.
     """
 
-    def __init__(self, folder: str, every_n_steps: int = 200) -> None:
+    def __init__(self, folder: str, every_n_steps: int = 200, formats: Sequence[str] = ("ply",)) -> None:
         self.folder = Path(folder)
         self.every_n_steps = every_n_steps
+        self.formats = list(formats)
         self._batch: Any = None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
@@ -310,7 +313,8 @@ class MeshLogger(Callback):
             self.folder.mkdir(parents=True, exist_ok=True)
             for index in range(len(meshes)):
                 suffix = f"_{index}" if len(meshes) > 1 else ""
-                IO().save_mesh(meshes[index].detach().cpu(), self.folder / f"{name}{suffix}.ply")
+                for ending in self.formats:
+                    IO().save_mesh(meshes[index].detach().cpu(), self.folder / f"{name}{suffix}.{ending}")
         self._batch = None
 
     def _show(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:

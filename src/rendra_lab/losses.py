@@ -1,7 +1,7 @@
 """Losses that several tasks use. Each takes the prediction, then the target, and returns a scalar.
 
-Shapes: images are (B, H, W, C), masks (B, H, W), but every loss here takes any shape that broadcasts.
-A mask is a weight per element in [0, 1], broadcast against the error; its mean then runs over the weight.
+Shapes: images are (B, H, W, C), masks (B, H, W), but every loss on images takes any shape that broadcasts; clouds are
+(B, P, 3). A mask is a weight per element in [0, 1], broadcast against the error; its mean then runs over the weight.
 """
 
 from __future__ import annotations
@@ -9,6 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
+
+from rendra.loss import chamfer_distance
+from rendra.loss.point_mesh_distance import point_face_distance
+from rendra.ops import knn_points
+from rendra.structures import Meshes
 
 
 class SquaredError:
@@ -87,6 +92,77 @@ def binary_cross_entropy(prediction: Tensor, target: Tensor, mask: Tensor | None
 def mean_square(prediction: Tensor) -> Tensor:
     """The mean of squares of the prediction alone: the simplest regulariser."""
     return prediction.square().mean()
+
+
+def chamfer(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean squared distances of two clouds (B, P, 3), (B, Q, 3) to each other's nearest points, summed: a scalar."""
+    return chamfer_distance(prediction, target)[0]
+
+
+def cloud_to_surface(mesh: Meshes, points: Tensor) -> Tensor:
+    """The mean squared distance of points (1, P, 3) from the surface of a batch of one mesh: a scalar."""
+    triangles = mesh.verts_packed()[mesh.faces_packed()]
+    first = torch.zeros(1, dtype=torch.long, device=points.device)
+    return point_face_distance(points[0], first, triangles, first, points.shape[1], 0.0).mean()
+
+
+def surface_to_cloud(samples: Tensor, points: Tensor, spacing: Tensor, slack: float = 1.0) -> Tensor:
+    """How far samples of a surface are from a cloud, in squares of what exceeds a slack: a scalar.
+
+    A cloud says where a surface is only up to the gaps between its points: within them the surface is free, and
+    smooth.
+
+    Args:
+        samples: (B, S, 3), on the surface.
+        points: (B, P, 3), the cloud.
+        spacing: (B,), the distance between neighbours in the cloud.
+        slack: free distance, in spacings.
+    """
+    distance = knn_points(samples, points).dists[..., 0].clamp_min(1e-12).sqrt()
+    return (distance - slack * spacing[:, None]).clamp_min(0).square().mean()
+
+
+class SheetSeparation:
+    """Keeps two sheets of one surface that lie back to back, or face to face, from touching.
+
+    Of the vertices nearest to a vertex, the nearest one whose normal points the other way is on the other sheet; what
+    their distance along the normal lacks is squared, and averaged over the vertices. The sheets stay on the side
+    where they are, so that the term prevents folds and does not undo them.
+
+    Args:
+        distance: at which sheets stop noticing each other.
+        neighbours: how many of the nearest vertices are looked at.
+        opposite: cosine of the two normals below which they belong to different sheets.
+        most: vertices that are asked at a time, drawn at random; they stand for all.
+    """
+
+    def __init__(
+        self, distance: float, neighbours: int = 24, opposite: float = -0.2, most: int | None = 2500
+    ) -> None:
+        if not distance > 0 or neighbours < 1 or (most is not None and most < 1):
+            raise ValueError(
+                "distance must be positive, neighbours and most at least 1, "
+                f"got distance={distance}, neighbours={neighbours}, most={most}"
+            )
+        self.distance = distance
+        self.neighbours = neighbours
+        self.opposite = opposite
+        self.most = most
+
+    def __call__(self, mesh: Meshes) -> Tensor:
+        """The term of a batch of one mesh: a scalar."""
+        verts = mesh.verts_packed()
+        with torch.no_grad():
+            normals = mesh.verts_normals_packed()
+            asked = torch.randperm(len(verts), device=verts.device)[: self.most]
+            near = knn_points(verts[None, asked], verts[None], K=min(self.neighbours, len(verts))).idx[0]
+            away = ((verts[asked, None] - verts[near]) * normals[asked, None]).sum(-1).abs()
+            same_sheet = (normals[asked, None] * normals[near]).sum(-1) >= self.opposite
+            gap, which = away.masked_fill(same_sheet, torch.inf).min(1)
+            close = (gap < self.distance).nonzero()[:, 0]
+            here, there = asked[close], near[close, which[close]]
+        gap = ((verts[here] - verts[there]) * normals[here]).sum(-1).abs()
+        return (self.distance - gap).square().sum() / max(len(asked), 1)
 
 
 def _mean(error: Tensor, mask: Tensor | None) -> Tensor:

@@ -1,6 +1,7 @@
 """The only home of metrics. Each takes the prediction, then the target, and returns a scalar.
 
-Shapes: images are (B, H, W, C) or (H, W, C) with values in [0, 1]; masks and silhouettes (B, H, W) or (H, W).
+Shapes: images are (B, H, W, C) or (H, W, C) with values in [0, 1]; masks and silhouettes (B, H, W) or (H, W); clouds
+(1, P, 3), and a surface is a batch of one mesh.
 An average over a batch is the mean over images, as published tables have it.
 """
 
@@ -10,9 +11,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rendra.loss import chamfer_distance
+from rendra.ops import knn_points, sample_points_from_meshes, self_intersections
+from rendra.structures import Meshes
 from rendra.transforms import so3_log_map
+from rendra_lab import losses
 
 _PSNR_CEILING_DB = 100.0  # of two equal images
+_SURFACE_SAMPLES = 10_000  # that stand for a surface
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor) -> Tensor:
@@ -77,6 +83,41 @@ def length_error_percent(vector: Tensor, truth: Tensor) -> Tensor:
 def position_error_percent(position: Tensor, truth: Tensor) -> Tensor:
     """How far positions (B, 3) are off, in percent of the true distance from the origin, the mean over the batch."""
     return (100 * (position - truth).norm(dim=1) / truth.norm(dim=1)).mean()
+
+
+def cloud_to_surface_rms(mesh: Meshes, points: Tensor) -> Tensor:
+    """The root of the mean squared distance of points (1, P, 3) from a surface."""
+    return losses.cloud_to_surface(mesh, points).sqrt()
+
+
+def surface_chamfer(mesh: Meshes, points: Tensor) -> Tensor:
+    """Mean squared distances between 10,000 points of a surface and a cloud (1, P, 3), both ways, summed."""
+    return chamfer_distance(_samples(mesh), points)[0]
+
+
+def surface_f_score(mesh: Meshes, points: Tensor, threshold: float) -> Tensor:
+    """The harmonic mean of precision and recall, in [0, 1].
+
+    Precision is the share of 10,000 points of the surface that are nearer than `threshold` to the cloud (1, P, 3),
+    recall the share of the cloud that is nearer than that to the points of the surface.
+    Source: Knapitsch et al., "Tanks and Temples", 2017, Sec. 3.
+    """
+    samples = _samples(mesh)
+    near = [knn_points(a, b).dists < threshold**2 for a, b in ((samples, points), (points, samples))]
+    precision, recall = (hits.float().mean() for hits in near)
+    return 2 * precision * recall / (precision + recall).clamp_min(1e-12)
+
+
+def num_self_intersections(mesh: Meshes) -> Tensor:
+    """How many pairs of a surface's faces cross each other."""
+    return torch.tensor(float(len(self_intersections(mesh))), device=mesh.device)
+
+
+def _samples(mesh: Meshes) -> Tensor:
+    """Points on a surface (1, 10,000, 3), the same at every call; the random state is left as it is."""
+    with torch.random.fork_rng([mesh.device] if mesh.device.type == "cuda" else []):
+        torch.manual_seed(0)
+        return sample_points_from_meshes(mesh, _SURFACE_SAMPLES)
 
 
 def _batched(prediction: Tensor, target: Tensor, dims: int = 4) -> tuple[Tensor, Tensor]:

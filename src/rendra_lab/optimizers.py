@@ -147,3 +147,47 @@ def _damped_step(normal: Tensor, slope: Tensor, damping: Tensor, longest: float)
     step = torch.linalg.solve(normal + torch.diag_embed(damping[:, None] * diagonal + floor), -slope)
     step = step.nan_to_num(0.0, 0.0, 0.0)
     return step * (longest / step.norm(dim=1, keepdim=True).clamp(min=longest))
+
+
+class UniformAdam(torch.optim.Optimizer):
+    """Adam with one second moment a parameter tensor, the largest of its elements'.
+
+    Elements keep their gradients' proportions, so that a step points where the gradient does: on vertices it does not
+    depend on the axes, and a diffused gradient stays smooth. (Nicolet et al., "Large Steps in Inverse Rendering of
+    Geometry", SIGGRAPH Asia 2021, Sec. 4.)
+
+    Args:
+        params: the parameters, or groups of them.
+        lr: about the largest change of an element in one step, in the parameter's unit.
+        betas: decay of the first and the second moment.
+    """
+
+    def __init__(self, params: Any, lr: float = 0.1, betas: Sequence[float] = (0.9, 0.999)) -> None:
+        first, second = betas
+        if not (0 <= first < 1 and 0 <= second < 1):
+            raise ValueError(f"betas must lie in [0, 1), got {list(betas)}")
+        super().__init__(params, {"lr": lr, "betas": (float(first), float(second))})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """One step of every parameter that has a gradient."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._move(parameter, group["lr"], *group["betas"])
+        return loss
+
+    def _move(self, parameter: Tensor, lr: float, first: float, second: float) -> None:
+        state, gradient = self.state[parameter], parameter.grad
+        assert gradient is not None
+        if not state:
+            state.update(step=0, mean=torch.zeros_like(parameter), square=torch.zeros_like(parameter))
+        state["step"] += 1
+        state["mean"].lerp_(gradient, 1 - first)
+        state["square"].lerp_(gradient.square(), 1 - second)
+        size = (state["square"].amax() / (1 - second ** state["step"])).sqrt()
+        parameter.sub_(state["mean"] / size.clamp_min(1e-20), alpha=lr / (1 - first ** state["step"]))

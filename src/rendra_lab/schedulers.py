@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
+
+from rendra_lab.terms import PiecewiseLinear
 
 
 def cosine(optimizer: Optimizer, total_steps: int, final_factor: float = 0.01, warmup_steps: int = 0) -> LambdaLR:
@@ -28,3 +31,8 @@ def exponential(optimizer: Optimizer, total_steps: int, final_factor: float = 0.
     if final_factor <= 0:
         raise ValueError(f"final_factor must be above 0, got {final_factor}")
     return LambdaLR(optimizer, lambda step: final_factor ** (step / max(total_steps, 1)))
+
+
+def piecewise(optimizer: Optimizer, knots: Sequence[Sequence[float]]) -> LambdaLR:
+    """The rate times a factor that follows straight lines between knots (step, factor): `PiecewiseLinear`."""
+    return LambdaLR(optimizer, PiecewiseLinear(knots))

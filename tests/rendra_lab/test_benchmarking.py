@@ -19,7 +19,9 @@ from rendra_lab.benchmarking import (
     select,
     table_of,
 )
-from rendra_lab.benchmarks import BENCHMARKS, ROOT, Library, Scene, write_grid_obj
+from rendra_lab.benchmarks import BENCHMARKS
+from rendra_lab.benchmarks.geometry import write_grid_obj
+from rendra_lab.benchmarks.scene import ROOT, Library, Scene
 from rendra_lab.data.meshes import load_mesh
 from rendra_lab.errors import UserError
 
@@ -145,7 +147,9 @@ def test_names_are_unique_and_proofs_exist() -> None:
 
 @pytest.mark.parametrize("timed", [b for b in BENCHMARKS if not b.is_command], ids=lambda b: b.name)
 def test_every_operation_runs(timed: Benchmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rendra_lab.benchmarks.write_grid_obj", lambda path, side: write_grid_obj(path, min(side, 5)))
+    monkeypatch.setattr(
+        "rendra_lab.benchmarks.geometry.write_grid_obj", lambda path, side: write_grid_obj(path, min(side, 5))
+    )
     scene = Scene(load_mesh("ico_sphere", level=1), None, torch.device("cpu"), tmp_path)
     timed.prepare(Library("rendra"), scene)()
 

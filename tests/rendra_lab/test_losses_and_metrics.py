@@ -8,6 +8,7 @@ import torch
 from assertions import assert_close, assert_finite
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from rendra.structures import Meshes
 from rendra_lab import losses, metrics
 
 
@@ -99,3 +100,75 @@ def test_the_books_silhouette_loss_is_a_sum() -> None:
     loss = losses.SummedSquaredError()
     assert_close(loss(torch.ones(2, 3, 3), torch.zeros(2, 3, 3)), 18.0)
     assert loss.residuals(torch.ones(2, 3, 3), torch.zeros(2, 3, 3)).shape == (18,)
+
+
+def plate(height: float, flip: bool = False, side: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
+    """A square of side 1 at z = height, which faces up, or down."""
+    ticks = torch.linspace(0, 1, side)
+    x, y = torch.meshgrid(ticks, ticks, indexing="xy")
+    verts = torch.stack([x, y, torch.full_like(x, height)], -1).reshape(-1, 3)
+    corner = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1, 1)
+    faces = torch.cat([corner + torch.tensor([[0, 1, side + 1]]), corner + torch.tensor([[0, side + 1, side]])])
+    return verts, faces.flip(1) if flip else faces
+
+
+def slab(thickness: float) -> Meshes:
+    """Two squares back to back."""
+    top, up = plate(thickness)
+    bottom, down = plate(0.0, flip=True)
+    return Meshes([torch.cat([top, bottom])], [torch.cat([up, down + len(top)])])
+
+
+def test_distances_from_a_surface_are_squared_and_averaged() -> None:
+    verts, faces = plate(0.0)
+    points = torch.tensor([[[0.31, 0.47, 2.0], [0.5, 0.5, -1.0], [2.0, 0.5, 0.0]]])
+    mesh = Meshes([verts], [faces])
+    assert_close(losses.cloud_to_surface(mesh, points), (4 + 1 + 1) / 3)
+    assert_close(metrics.cloud_to_surface_rms(mesh, points), 2**0.5)
+
+
+def test_a_surface_is_free_within_the_gaps_of_a_cloud() -> None:
+    cloud, spacing = torch.zeros(1, 1, 3), torch.tensor([0.5])
+    samples = torch.tensor([[[0.4, 0, 0], [0, 0.5, 0], [0, 0, 1.5]]])
+    assert_close(losses.surface_to_cloud(samples, cloud, spacing), 1 / 3)
+    assert_close(losses.surface_to_cloud(samples, cloud, spacing, slack=0.0), (0.16 + 0.25 + 2.25) / 3)
+
+
+def test_sheets_push_each_other_away_within_their_distance() -> None:
+    term = losses.SheetSeparation(distance=0.1, most=None)
+    assert_close(term(slab(0.04)), 0.06**2, atol=1e-6)
+    assert_close(term(slab(0.2)), 0.0)
+    mesh = slab(0.04)
+    verts = mesh.verts_packed().requires_grad_()
+    term(mesh.update_padded(verts[None])).backward()
+    top, bottom = verts.grad[:36, 2], verts.grad[36:, 2]
+    assert bool((top < 0).all())  # a step against the gradient opens the gap
+    assert bool((bottom > 0).all())
+
+
+def test_f_score_and_chamfer_know_a_surface_from_its_shifted_cloud() -> None:
+    verts, faces = plate(0.0)
+    mesh = Meshes([verts], [faces])
+    cloud = torch.cat([torch.rand(1, 4000, 2), torch.full((1, 4000, 1), 0.05)], -1)
+    assert_close(metrics.surface_f_score(mesh, cloud, threshold=0.1), 1.0)
+    assert_close(metrics.surface_f_score(mesh, cloud, threshold=0.04), 0.0)
+    assert float(metrics.surface_chamfer(mesh, cloud)) == pytest.approx(2 * 0.05**2, rel=0.1)
+
+
+def test_crossing_sheets_are_counted() -> None:
+    assert_close(metrics.num_self_intersections(slab(0.1)), 0.0)
+    assert float(metrics.num_self_intersections(slab_with_a_spike())) > 0
+
+
+def slab_with_a_spike() -> Meshes:
+    mesh = slab(0.1)
+    verts = mesh.verts_packed().clone()
+    verts[14, 2] = -0.5  # a vertex of the upper plate, pulled through the lower one
+    return mesh.update_padded(verts[None])
+
+
+def test_a_surfaces_metrics_leave_the_random_state_alone() -> None:
+    cloud = torch.rand(1, 50, 3)
+    before = torch.get_rng_state()
+    metrics.surface_chamfer(slab(0.5), cloud)
+    assert torch.equal(before, torch.get_rng_state())

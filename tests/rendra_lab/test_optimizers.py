@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on problems whose answers are known."""
+"""Optimizers on problems whose answers are known."""
 
 import itertools
 
@@ -7,7 +7,7 @@ import torch
 from assertions import assert_close
 from torch import nn
 
-from rendra_lab.optimizers import LevenbergMarquardt, levenberg_marquardt_step
+from rendra_lab.optimizers import LevenbergMarquardt, UniformAdam, levenberg_marquardt_step
 
 
 def fit(parameter, residuals, steps, **settings):
@@ -81,3 +81,34 @@ def test_problems_side_by_side_do_not_touch_each_other():
 def test_bad_settings_are_named():
     with pytest.raises(ValueError, match="wide to a fine"):
         LevenbergMarquardt([nn.Parameter(torch.zeros(1))], difference=(0.1, 0.2))
+
+
+def test_uniform_adam_is_adam_for_a_single_number():
+    mine, theirs = nn.Parameter(torch.tensor([2.0])), nn.Parameter(torch.tensor([2.0]))
+    pairs = [(mine, UniformAdam([mine], lr=0.1)), (theirs, torch.optim.Adam([theirs], lr=0.1, eps=0))]
+    for _ in range(20):
+        for x, optimizer in pairs:
+            optimizer.zero_grad()
+            (x**4).sum().backward()
+            optimizer.step()
+        assert_close(mine.detach(), theirs.detach(), atol=1e-6)
+
+
+def test_uniform_adam_keeps_the_direction_of_the_gradient():
+    x = nn.Parameter(torch.zeros(4, 3))
+    slope = torch.randn(4, 3)
+    x.grad = slope.clone()
+    UniformAdam([x], lr=0.5).step()
+    assert_close(x.detach(), -0.5 * slope / slope.abs().amax(), atol=1e-5)
+
+
+def test_uniform_adam_leaves_alone_what_has_no_gradient_and_survives_a_zero_one():
+    idle, flat = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))
+    flat.grad = torch.zeros(2)
+    UniformAdam([idle, flat], lr=0.5).step()
+    assert_close(torch.stack([idle, flat]).detach(), torch.ones(2, 2))
+
+
+def test_uniform_adam_refuses_betas_outside_their_range():
+    with pytest.raises(ValueError, match="betas"):
+        UniformAdam([nn.Parameter(torch.zeros(1))], betas=(0.9, 1.0))

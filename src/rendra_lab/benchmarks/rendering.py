@@ -1,112 +1,19 @@
-"""The operations that `scripts/benchmark.py` times.
-
-An operation of the public API is written once against a `Library`, which is rendra or PyTorch3D: the same calls on
-the same input. Steps of tasks and whole commands are rendra's alone.
-"""
+"""Rasterising, shading, sampling textures, and the camera of a picture."""
 
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from importlib import import_module
-from itertools import count
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from rendra.renderer import TexturesUV, TexturesVertex
-from rendra.structures import Meshes
 from rendra_lab.benchmarking import Benchmark, Run
+from rendra_lab.benchmarks.scene import Library, Scene, command, timed
 
-ROOT = Path(__file__).parents[2]
 SIGMA = 1e-4  # squared NDC, the usual width of an edge
 REACH = math.log(1 / 1e-4 - 1) * SIGMA  # blur radius at which the sigmoid of an edge has fallen to 1e-4
-_VIEW = (2.7, 0.0, 180.0)  # distance, elevation and azimuth in degrees: the front of a cow
-
-
-class Library:
-    """The modules of rendra, or of PyTorch3D under the same names.
-
-    Args:
-        name: rendra or pytorch3d.
-
-    Raises:
-        ImportError: the library is not installed, or does not load.
-    """
-
-    renderer: ModuleType
-    structures: ModuleType
-    io: ModuleType
-    utils: ModuleType
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        for part in ("renderer", "structures", "io", "utils"):
-            setattr(self, part, import_module(f"{name}.{part}"))
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What is rendered, and where.
-
-    Attributes:
-        mesh: a batch of one with a texture, of rendra.
-        path: its file; None for the project's own cow.
-        device: cpu or cuda.
-        folder: for temporary files.
-    """
-
-    mesh: Meshes
-    path: Path | None
-    device: torch.device
-    folder: Path
-
-    def mesh_of(self, library: Library) -> Any:
-        """The mesh in the words of a library."""
-        own, renderer = self.mesh.textures, library.renderer
-        if isinstance(own, TexturesUV):
-            textures = renderer.TexturesUV(own.maps_padded(), own.faces_uvs_list(), own.verts_uvs_list())
-        elif isinstance(own, TexturesVertex):
-            textures = renderer.TexturesVertex(own.verts_features_list())
-        else:
-            textures = renderer.TexturesVertex([torch.ones_like(self.mesh.verts_packed())])
-        return library.structures.Meshes(self.mesh.verts_list(), self.mesh.faces_list(), textures)
-
-    def cameras_of(self, library: Library) -> Any:
-        """The usual camera in the words of a library."""
-        R, T = library.renderer.look_at_view_transform(*_VIEW)
-        return library.renderer.FoVPerspectiveCameras(R=R, T=T, device=self.device)
-
-    def rasterizer_of(self, library: Library, **settings: Any) -> Any:
-        """A rasterizer with the usual camera."""
-        settings = library.renderer.RasterizationSettings(**settings)
-        return library.renderer.MeshRasterizer(self.cameras_of(library), settings)
-
-    @cached_property
-    def name(self) -> str:
-        """The mesh for people."""
-        origin = "procedural cow" if self.path is None else self.path.name
-        return f"{origin}, {len(self.mesh.faces_packed()):,} faces"
-
-
-def _timed(forward: Callable[[], Any], leaf: Tensor, backward: bool) -> Run:
-    """`forward` without gradients, or with those of fixed upstream gradients with respect to `leaf`."""
-    if not backward:
-        return torch.no_grad()(forward)
-    leaf.requires_grad_()
-    upstream = [torch.rand_like(output) for output in forward()]
-
-    def run() -> None:
-        torch.autograd.grad(forward(), leaf, upstream)
-
-    return run
 
 
 def _rasterization(layers: int, blur_radius: float, backward: bool) -> Callable[[Library, Scene], Run]:
@@ -125,7 +32,7 @@ def _rasterization(layers: int, blur_radius: float, backward: bool) -> Callable[
             )
             return fragments
 
-        return _timed(forward, offsets, backward)
+        return timed(forward, offsets, backward)
 
     return prepare
 
@@ -146,7 +53,7 @@ def _rendering(
             getattr(api, shader)(**parts),
         )
         offsets = torch.zeros_like(mesh.verts_packed())
-        return _timed(lambda: [renderer(mesh.offset_verts(offsets))], offsets, backward)
+        return timed(lambda: [renderer(mesh.offset_verts(offsets))], offsets, backward)
 
     return prepare
 
@@ -166,25 +73,6 @@ def _sample_textures(library: Library, scene: Scene) -> Run:
 
 def _ico_sphere(library: Library, scene: Scene) -> Run:
     return lambda: library.utils.ico_sphere(4, scene.device)
-
-
-def _load_obj(library: Library, scene: Scene) -> Run:
-    path = scene.folder / "grid.obj"
-    write_grid_obj(path, side=388)
-    return lambda: library.io.load_obj(path, load_textures=False)
-
-
-def write_grid_obj(path: Path, side: int) -> None:
-    """A wavy square of 2 (side - 1)^2 triangles with texture coordinates, as a text file."""
-    ticks = [k / (side - 1) for k in range(side)]
-    points = [(u, v) for v in ticks for u in ticks]
-    lines = [f"v {u:.6f} {math.sin(9 * u) * math.cos(9 * v):.6f} {v:.6f}" for u, v in points]
-    lines += [f"vt {u:.6f} {v:.6f}" for u, v in points]
-    for row in range(side - 1):
-        for a in range(row * side + 1, (row + 1) * side):
-            b, c, d = a + 1, a + side, a + side + 1
-            lines += [f"f {a}/{a} {b}/{b} {d}/{d}", f"f {a}/{a} {d}/{d} {c}/{c}"]
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _pose_step(uses_texture: bool, layers: int) -> Callable[[Library, Scene], Run]:
@@ -210,27 +98,6 @@ def _pose_step(uses_texture: bool, layers: int) -> Callable[[Library, Scene], Ru
             optimizer.step()
 
         return step
-
-    return prepare
-
-
-def _command(*arguments: str) -> Callable[[Library, Scene], Run]:
-    """`python train.py ...` with the scene's mesh, from start to end."""
-
-    def prepare(library: Library, scene: Scene) -> Run:
-        trainer = "gpu" if scene.device.type == "cuda" else "cpu"
-        fixed = [sys.executable, str(ROOT / "train.py"), f"trainer={trainer}", *arguments]
-        if scene.path is not None:
-            fixed.append(f"mesh.path={scene.path.resolve()}")
-        numbers = count()
-
-        def run() -> None:
-            command = [*fixed, f"hydra.run.dir={scene.folder / f'run-{next(numbers)}'}"]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                raise RuntimeError(f"{' '.join(command)} ended with code {done.returncode}:\n{done.stderr[-2000:]}")
-
-        return run
 
     return prepare
 
@@ -301,7 +168,7 @@ def _pose_benchmarks() -> list[Benchmark]:
     ]
 
 
-BENCHMARKS: tuple[Benchmark, ...] = (
+RENDERING: tuple[Benchmark, ...] = (
     *_raster_benchmarks(),
     *_silhouette_benchmarks(),
     *_phong_benchmarks(),
@@ -318,12 +185,11 @@ BENCHMARKS: tuple[Benchmark, ...] = (
         ("tests/rendra/renderer/mesh/test_textures.py",),
     ),
     Benchmark("ico_sphere", "ico_sphere(4)", _ico_sphere, ("tests/rendra/utils/test_shapes.py",)),
-    Benchmark("load_obj", "load_obj, 299,538 faces", _load_obj, ("tests/rendra/io/test_obj_io.py",), must_ms=1000),
     *_pose_benchmarks(),
     Benchmark(
         "command_pose_silhouette",
         "train.py experiment=pose_book_silhouette, 200 steps",
-        _command("experiment=pose_book_silhouette", "callbacks.stop=null"),
+        command("experiment=pose_book_silhouette", "callbacks.stop=null"),
         _COMMAND,
         must_ms=30_000,
         aim_ms=12_000,
@@ -333,7 +199,7 @@ BENCHMARKS: tuple[Benchmark, ...] = (
     Benchmark(
         "command_pose_from_nothing",
         "train.py experiment=pose_from_nothing",
-        _command("experiment=pose_from_nothing"),
+        command("experiment=pose_from_nothing"),
         _COMMAND,
         must_ms=60_000,
         aim_ms=15_000,

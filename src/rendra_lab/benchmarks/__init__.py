@@ -1,0 +1,10 @@
+"""The operations that `scripts/benchmark.py` times.
+
+An operation of the public API is written once against a `Library`, which is rendra or PyTorch3D: the same calls on
+the same input. Steps of tasks and whole commands are rendra's alone.
+"""
+
+from rendra_lab.benchmarks.geometry import GEOMETRY
+from rendra_lab.benchmarks.rendering import RENDERING
+
+BENCHMARKS = (*RENDERING, *GEOMETRY)
