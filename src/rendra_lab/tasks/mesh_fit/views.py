@@ -31,20 +31,30 @@ class CloudViews:
             raise ValueError(f"views.up must be a direction such as [0,0,1], or null, got {up}")
         self.up = None if up is None else [float(x) for x in up]
         self.size = (size[0], size[1])
+        self._points: Tensor | None = None  # whose pictures and frame are kept
+        self._pictures: dict[str, Tensor] = {}
+        self._turn = torch.eye(3)
 
     def __call__(self, points: Tensor, mesh: Meshes) -> dict[str, Tensor]:
         """Images (H, W, 3) of the points (P, 3) and of a batch of one mesh, by caption."""
-        turn = upright(points, self.up)
-        cloud = balls(points[:: -(-len(points) // _SHOWN)] @ turn)
-        surface = mesh.update_padded(mesh.verts_padded() @ turn)
+        if self._points is None or not torch.equal(self._points.to(points), points):
+            self._points, self._turn = points, upright(points, self.up)
+            cloud = balls(points[:: -(-len(points) // _SHOWN)] @ self._turn)
+            self._pictures = self._seen(cloud, points, "cloud")
+        surface = mesh.update_padded(mesh.verts_padded() @ self._turn.to(points))
         surface.textures = TexturesVertex(torch.tensor(_SURFACE).to(points).expand_as(mesh.verts_padded()))
-        frame = _frame(points @ turn)
-        pictures = {}
-        for name, azimuth in (("front", 15.0), ("side", 105.0)):
-            studio = _studio(azimuth, frame, self.size)
-            pictures[f"cloud, {name}"] = studio.render(cloud)[..., :3]
-            pictures[f"surface, {name}"] = studio.render(surface)[..., :3]
-        return pictures
+        fitted = self._seen(surface, points, "surface")
+        pairs = zip(self._pictures.items(), fitted.items(), strict=True)
+        return {name: image for pair in pairs for name, image in pair}
+
+    def _seen(self, mesh: Meshes, points: Tensor, title: str) -> dict[str, Tensor]:
+        """Pictures of a mesh in the frame of the points."""
+        frame = _frame(points @ self._turn.to(points))
+        views = {"front": 15.0, "side": 105.0}
+        return {
+            f"{title}, {name}": _studio(azimuth, frame, self.size).render(mesh)[..., :3]
+            for name, azimuth in views.items()
+        }
 
 
 def upright(points: Tensor, up: Sequence[float] | None = None) -> Tensor:
