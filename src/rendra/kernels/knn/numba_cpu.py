@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
+from rendra.kernels.knn.group import GROUP_SCRATCH, found_by, group_at, nearest_of_group
 from rendra.kernels.knn.lanes import (
     LANES,
     float_of_bits,
@@ -25,8 +26,6 @@ from rendra.kernels.knn.search import (
     Question,
     collect,
     find_roots,
-    leaf_distance,
-    near_key,
     query_at,
     sort_heap,
     tree_at,
@@ -37,6 +36,7 @@ from rendra.kernels.knn.tree import INDEX_BITS, INDEX_MASK, LEAF, NOTHING, build
 from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 
 _SLOTS_AT_ONCE = 4 * LANES  # whose points a thread asks for in turn
+_GROUPED_AT_ONCE = 16 * LANES  # the same where 16 ask at once
 _POINTS_AT_ONCE = 512  # whose gradients a thread gathers in turn
 
 _Tree = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -92,10 +92,10 @@ def nearest_sums(
     """
     first, second = (_grow(cloud) for cloud in clouds)
     slots = max(first[1].shape[1], second[1].shape[1])
-    sums = np.zeros((2, len(clouds[0]), -(-slots // _SLOTS_AT_ONCE)))
+    sums = np.zeros((2, len(clouds[0]), -(-slots // _GROUPED_AT_ONCE)))
     match = np.empty((2, len(clouds[0]), slots), np.int32)
     workers = num_threads()
-    scratch = np.empty((workers, SCRATCH + 1), np.int64)
+    scratch = np.empty((workers, GROUP_SCRATCH), np.int64)
     _build(*clouds, *lengths, axes, first, second, workers)
     looked_at = _match(
         *lengths, *weights, norm, (clouds[0].shape[1], clouds[1].shape[1]), _addresses(*first), _addresses(*second),
@@ -188,9 +188,9 @@ def _write(keys, ask, dists, idx):
 def _match(lengths1, lengths2, weights1, weights2, norm, shape, first, second, match, sums, scratch, scratch_address):
     """The nearest slot of the other cloud for each slot, both ways, and the sums of the distances of every chunk."""
     _, batch, chunks = sums.shape
-    workers, looked_at, ask = len(scratch), 0, Question(norm, 3, np.float32(-1), 1)
+    workers, looked_at = len(scratch), 0
     for worker in prange(workers):
-        walk = walk_at(scratch_address + 8 * scratch.shape[1] * worker)
+        group = group_at(scratch_address + 8 * scratch.shape[1] * worker)
         seen = 0
         for task in range(worker, 2 * batch * chunks, workers):
             way, n, chunk = task // chunks // batch, task // chunks % batch, task % chunks
@@ -199,19 +199,17 @@ def _match(lengths1, lengths2, weights1, weights2, norm, shape, first, second, m
             leaves, blocks = tree_size(shape[1 - way])
             tree = tree_at(second if way == 0 else first, leaves, blocks, n)
             own = (first[0] if way == 0 else second[0]) + 4 * 3 * _num_slots(shape[way]) * n
-            levels = find_roots(num_others, walk.roots)
-            begin, end = chunk * _SLOTS_AT_ONCE, min((chunk + 1) * _SLOTS_AT_ONCE, length)
-            total, nearest = 0.0, np.int64(-1)
-            for slot in range(begin, end if num_others and weight != 0 else begin):
-                xyz, key = query_at(own, slot), EMPTY
-                if nearest >= 0:
-                    key = near_key(leaf_distance(tree.leaves, nearest, xyz, norm), read_int32(tree.indices, nearest))
-                write_int64(walk.heap, 0, key)
-                looks, better = collect(0, xyz, 0, tree, levels, ask, EMPTY, walk)
-                nearest = better if better >= 0 else nearest
-                seen += looks
-                match[way, n, slot] = nearest
-                total += float_of_bits(np.int32(read_int64(walk.heap, 0) >> INDEX_BITS))
+            levels = find_roots(num_others, group.roots)
+            begin, end = chunk * _GROUPED_AT_ONCE, min((chunk + 1) * _GROUPED_AT_ONCE, length)
+            total, seed = 0.0, np.int64(-1)
+            for slot in range(begin, end if num_others and weight != 0 else begin, LANES):
+                count = min(LANES, end - slot)
+                seen += nearest_of_group(own + 4 * 3 * slot, count, tree, levels, norm, seed, group)
+                for lane in range(count):
+                    dist, _, place = found_by(group, lane)
+                    match[way, n, slot + lane] = place
+                    total += dist
+                seed = np.int64(match[way, n, slot + count - 1]) // LANES
             sums[way, n, chunk] = total
         looked_at += seen
     return looked_at

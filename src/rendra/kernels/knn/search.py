@@ -146,7 +146,7 @@ def collect(row, xyz, points, tree, levels, ask, bound, walk):
                 mask &= _near_boxes(tree, read_int64(walk.roots, level) + block, xyz, cut, ask.norm)
             continue
         if level > 1:
-            lane = _promising_lane(tree, read_int64(walk.roots, level) + block, xyz, mask, ask.norm)
+            lane = promising_lane(tree, read_int64(walk.roots, level) + block, xyz, mask, ask.norm)
             write_int64(walk.masks, level, mask & ~(np.int64(1) << lane))
             write_int64(walk.blocks, level, block)
             level -= 1
@@ -229,7 +229,7 @@ def _near_points(tree, leaf, xyz, cut, norm):
 
 
 @scalar_kernel
-def _promising_lane(tree, block, xyz, mask, norm):
+def promising_lane(tree, block, xyz, mask, norm):
     """The nearest box of the mask if there are many, else any: then the search is well bounded already."""
     many = mask
     for _ in range(_FEW):
