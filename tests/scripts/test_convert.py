@@ -328,7 +328,7 @@ def test_mistakes_are_one_line(here, capsys):
         (("in.obj", "out.ply", "--ascii", "--decimals", "99"), "convert.py: decimal_places is 99"),
         (("in.obj", "out.obj", "--binary"), "convert.py: OBJ is a text format"),
         (("one.xyz", "out.xyz", "--fit", "1"), "convert.py: all points coincide"),
-        (("in.obj", "no/such/out.ply"), "convert.py: [Errno 2]"),
+        (("in.obj", "no/such/out.ply"), "convert.py: [Errno 2] No such file or directory: 'no/such/out.ply'\n"),
     ]:
         assert refused(capsys, *arguments).startswith(message), arguments
     assert not [each.name for each in here.iterdir() if each.name.startswith("out")]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from rendra.io.errors import MeshFormatError
@@ -36,6 +36,8 @@ def decode_image(data: bytes, name: str) -> Tensor:
         raise
     except Image.DecompressionBombError as error:
         raise MeshFormatError("the image is too large", name, expected=_limit()) from error
+    except UnidentifiedImageError as error:  # its own words name a buffer of ours
+        raise MeshFormatError("cannot decode the image (unknown kind)", name, expected=", ".join(_FORMATS)) from error
     except Exception as error:  # decoders raise what they like: OSError, SyntaxError, struct.error, KeyError
         raise MeshFormatError(f"cannot decode the image ({error})", name, expected=", ".join(_FORMATS)) from error
     return torch.from_numpy(pixels)

@@ -186,6 +186,10 @@ def _write_path(path: str, data: bytes, path_manager: PathManager | None) -> Non
         with open(draft, "xb") as handle:
             handle.write(data)
         os.replace(draft, target)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            os.unlink(draft)
+        raise OSError(error.errno, error.strerror, path) from error  # nobody knows the draft
     except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(draft)

@@ -34,6 +34,7 @@ _HELD: dict[str, tuple[type[TexturesBase], ...]] = {
 }
 _WITH_COMPANIONS = (".obj", ".gltf")
 _WITHOUT_NORMALS = (".stl",)
+_MOST_SAMPLES = 50_000_000  # with normals and colours under 10 GB
 # Rows are where x, y and z of a row vector go.
 _TURNS = {
     "z-to-y": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
@@ -79,6 +80,10 @@ class Conversion:
                 raise ValueError(f"{name} is {value}; expected a positive number")
         if self.sample is not None and self.sample < 1:
             raise ValueError(f"sample is {self.sample}; expected 1 point or more")
+        if self.sample is not None and self.sample > _MOST_SAMPLES:
+            raise ValueError(f"sample is {self.sample}; expected at most {_MOST_SAMPLES:,} points")
+        if not -(2**63) <= self.seed < 2**64:
+            raise ValueError(f"seed is {self.seed}; expected a whole number of 64 bits")
         if self.scale is not None and self.fit is not None:
             raise ValueError("scale and fit exclude each other")
         if self.sample is not None and self.vertices:
@@ -223,7 +228,7 @@ def _as_cloud(mesh: Meshes, options: Conversion) -> Pointclouds:
 
 def _moved(data: Meshes | Pointclouds, options: Conversion) -> Meshes | Pointclouds:
     """The same, turned, shifted and scaled."""
-    points = data.verts_packed() if isinstance(data, Meshes) else data.points_packed()
+    points = given = data.verts_packed() if isinstance(data, Meshes) else data.points_packed()
     normals = _given_normals(data)
     if options.up is not None:
         turn = points.new_tensor(_TURNS[options.up])
@@ -234,10 +239,19 @@ def _moved(data: Meshes | Pointclouds, options: Conversion) -> Meshes | Pointclo
             points = points - (low + high) / 2
         points = points * _fitting(high - low, options.fit)
     points = points * (1.0 if options.scale is None else options.scale)
+    _demand_representable(given, points)
     listed = None if normals is None else [normals]
     if isinstance(data, Meshes):
         return Meshes([points], data.faces_list(), data.textures, verts_normals=listed)
     return Pointclouds([points], normals=listed, features=data.features_list())
+
+
+def _demand_representable(before: Tensor, after: Tensor) -> None:
+    """Nothing became infinite, and what had an extent still has one."""
+    if not after.isfinite().all():
+        raise ValueError("a coordinate is not finite once scaled: single precision ends at 3.4e38")
+    if (before != before[:1]).any() and not (after != after[:1]).any():
+        raise ValueError("all points coincide once scaled: single precision ends at 1e-45")
 
 
 def _given_normals(data: Meshes | Pointclouds) -> Tensor | None:

@@ -23,6 +23,8 @@ FACES = torch.tensor([[0, 1, 2]])
         ({"scale": 0.0}, "scale is 0.0; expected a positive number"),
         ({"fit": float("inf")}, "fit is inf"),
         ({"sample": -1}, "sample is -1"),
+        ({"sample": 3_000_000_000}, "sample is 3000000000; expected at most 50,000,000 points"),
+        ({"seed": 2**70}, "seed is 1180591620717411303424; expected a whole number of 64 bits"),
         ({"scale": 1.0, "fit": 1.0}, "scale and fit exclude each other"),
         ({"sample": 1, "vertices": True}, "sample and vertices exclude each other"),
     ],
@@ -52,7 +54,16 @@ def test_a_failure_writes_nothing(tmp_path):
     save_obj(tmp_path / "in.obj", VERTS * 1e37, FACES)
     with pytest.raises(ValueError, match="not finite"):
         convert(tmp_path / "in.obj", tmp_path / "out.ply", Conversion(scale=1e10))
+    with pytest.raises(ValueError, match="all points coincide once scaled"):
+        convert(tmp_path / "in.obj", tmp_path / "out.ply", Conversion(scale=1e-90))
     assert [each.name for each in tmp_path.iterdir()] == ["in.obj"]
+
+
+def test_a_place_that_cannot_be_written_is_named_as_it_was_given(tmp_path):
+    save_obj(tmp_path / "in.obj", VERTS, FACES)
+    with pytest.raises(FileNotFoundError) as caught:
+        convert(tmp_path / "in.obj", tmp_path / "no" / "out.ply")
+    assert caught.value.filename == str(tmp_path / "no" / "out.ply")
 
 
 def test_unseen_vertices_are_white():

@@ -111,6 +111,13 @@ def test_bad_images(data, message):
         images.decode_image(data, "paint.png")
 
 
+def test_what_is_no_image_is_said_in_words_of_the_user():
+    with pytest.raises(MeshFormatError) as caught:
+        images.decode_image(b"print('hello')", "paint.png")
+    assert "BytesIO" not in str(caught.value)
+    assert "PNG, JPEG" in str(caught.value)
+
+
 def test_truncated_images():
     noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=np.uint8))
     for kind in ("PNG", "JPEG", "TIFF", "WEBP"):
