@@ -4,13 +4,35 @@ Letters: N meshes, S samples of each, V and F packed vertices and faces, C chann
 """
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from rendra.structures.meshes import Meshes
+
+
+@overload
+def sample_points_from_meshes(
+    meshes: Meshes,
+    num_samples: int = ...,
+    return_normals: Literal[False] = False,
+    return_textures: Literal[False] = False,
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor: ...
+
+
+@overload
+def sample_points_from_meshes(
+    meshes: Meshes,
+    num_samples: int = ...,
+    return_normals: bool = False,
+    return_textures: bool = False,
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor | tuple[Tensor, ...]: ...
 
 
 def sample_points_from_meshes(

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -118,7 +117,7 @@ class SeenSolids(LightningDataModule):
     def look(self, number: int) -> SightBatch:
         """What is seen at a look; its number draws the points."""
         generator = torch.Generator().manual_seed((self.seed + 1) * 1_000_003 + number)
-        points = cast(Tensor, sample_points_from_meshes(self.seen, self.samples, generator=generator))
+        points = sample_points_from_meshes(self.seen, self.samples, generator=generator)
         return SightBatch(points, self.displacement, self.known, self.seen, self.titles)
 
     def train_dataloader(self) -> Looks:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -48,7 +48,7 @@ class Localize(Task[SightBatch, DisplacementPrediction]):
 
     def predict(self, batch: SightBatch) -> DisplacementPrediction:
         """Points on the known meshes, displaced; as many of each as are seen."""
-        samples = cast(Tensor, sample_points_from_meshes(batch.known, batch.points.shape[1]))
+        samples = sample_points_from_meshes(batch.known, batch.points.shape[1])
         return DisplacementPrediction(samples + self.displacement, self.displacement)
 
     def panels(self, prediction: DisplacementPrediction, batch: SightBatch) -> dict[str, Tensor]:
