@@ -98,13 +98,9 @@ def _read_obj(path: Path) -> Asset:
 
 
 def _read_other(path: Path) -> Asset:
-    io = IO()
-    suffixes = {suffix for each in io.mesh_interpreters for suffix in getattr(each, "known_suffixes", ())}
-    if path.suffix.lower() not in suffixes:
-        return Asset(path, cloud=io.load_pointcloud(path))
-    mesh = io.load_mesh(path)
-    if not len(mesh.faces_packed()):
-        return Asset(path, cloud=io.load_pointcloud(path))
+    mesh = IO().load_geometry(path)
+    if isinstance(mesh, Pointclouds):
+        return Asset(path, cloud=mesh)
     textures = mesh.textures
     if not isinstance(textures, TexturesUV):
         return Asset(path, mesh)

@@ -16,6 +16,13 @@ from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures import Meshes, Pointclouds
 
 
+def cloud_of_verts(mesh: Meshes) -> Pointclouds:
+    """The vertices of a batch of meshes with their normals, if there are any, and vertex colours as features."""
+    colors = mesh.textures.verts_features_list() if isinstance(mesh.textures, TexturesVertex) else None
+    normals = mesh.verts_normals_list() if mesh.has_verts_normals() else None
+    return Pointclouds(mesh.verts_list(), normals=normals, features=colors)
+
+
 class MeshFileAsCloud(PointcloudFormatInterpreter):
     """A mesh format for clouds: its vertices, normals and vertex colours.
 
@@ -35,11 +42,7 @@ class MeshFileAsCloud(PointcloudFormatInterpreter):
         if not endswith(path, self.known_suffixes):
             return None
         mesh = self._mesh_format.read(path, True, device, path_manager, **kwargs)
-        if mesh is None:
-            return None
-        colors = mesh.textures.verts_features_list() if isinstance(mesh.textures, TexturesVertex) else None
-        normals = mesh.verts_normals_list() if mesh.has_verts_normals() else None
-        return Pointclouds(mesh.verts_list(), normals=normals, features=colors)
+        return None if mesh is None else cloud_of_verts(mesh)
 
     def save(
         self, data: Pointclouds, path: FileLike, path_manager: PathManager | None, binary: bool | None, **kwargs: Any

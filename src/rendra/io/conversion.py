@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rendra.io._carried_colors import atlas_as_image, colors_at_verts, normals_at_verts, packed_materials
+from rendra.io._mesh_as_cloud import cloud_of_verts
 from rendra.io._obj_text import parse_obj
 from rendra.io._source import read_source
 from rendra.io.obj_io import Faces, Properties, load_obj, load_objs_as_meshes
@@ -166,17 +167,10 @@ def _demand_new(path: Path, options: Conversion) -> None:
 
 def _read(source: Path, options: Conversion) -> Meshes | Pointclouds:
     """A mesh, or a cloud where there are no faces."""
-    if not _holds_meshes(source):
-        return _with_features(IO().load_pointcloud(source), options.textures)
-    is_obj = source.suffix.lower() == ".obj"
-    mesh = _read_obj(source, options.textures) if is_obj else IO().load_mesh(source, options.textures)
-    if len(mesh.faces_packed()):
-        return mesh
-    return _cloud_of_verts(mesh)
-
-
-def _with_features(cloud: Pointclouds, wanted: bool) -> Pointclouds:
-    return cloud if wanted else Pointclouds(cloud.points_list(), cloud.normals_list())
+    if source.suffix.lower() != ".obj":
+        return IO().load_geometry(source, options.textures)
+    mesh = _read_obj(source, options.textures)
+    return cloud_of_verts(mesh) if mesh.isempty() else mesh
 
 
 def _read_obj(source: Path, textures: bool) -> Meshes:
@@ -205,20 +199,11 @@ def _needs_packing(faces: Faces, properties: Properties) -> bool:
     return len(faces.verts_idx) > 0 and (len(images) > 1 or (plain and colored))
 
 
-def _cloud_of_verts(mesh: Meshes) -> Pointclouds:
-    """The vertices with the normals that were given and with their colours."""
-    textures = mesh.textures
-    if isinstance(textures, TexturesUV | TexturesAtlas):
-        textures = colors_at_verts(mesh) if len(mesh.faces_packed()) else None
-    features = textures.verts_features_list() if isinstance(textures, TexturesVertex) else None
-    return Pointclouds(
-        mesh.verts_list(), normals=mesh.verts_normals_list() if mesh.has_verts_normals() else None, features=features
-    )
-
-
 def _as_cloud(mesh: Meshes, options: Conversion) -> Pointclouds:
     if options.sample is None:
-        return _cloud_of_verts(mesh)
+        if isinstance(mesh.textures, TexturesUV | TexturesAtlas):
+            mesh.textures = colors_at_verts(mesh)
+        return cloud_of_verts(mesh)
     generator = torch.Generator().manual_seed(options.seed)
     drawn = sample_points_from_meshes(
         mesh, options.sample, return_normals=True, return_textures=mesh.textures is not None, generator=generator

@@ -84,7 +84,7 @@ class MeshGlbFormat(MeshFormatInterpreter):
         include_textures: bool = True,
         **kwargs: Any,
     ) -> bool:
-        """Write one mesh, its normals if it was given any, its UV texture (as PNG) or vertex colours.
+        """Write one mesh, its normals if it `has_verts_normals`, its UV texture (as PNG) or vertex colours.
 
         All lies in the one file, also in a .gltf. The image has 8 bits a channel.
 

@@ -469,7 +469,7 @@ class MeshObjFormat(MeshFormatInterpreter):
         include_textures: bool = True,
         **kwargs: Any,
     ) -> bool:
-        """Write one mesh, its normals if it was given any, its UV texture or vertex colours.
+        """Write one mesh, its normals if it `has_verts_normals`, its UV texture or vertex colours.
 
         Raises:
             ValueError: `binary` is True, or the batch has not exactly one mesh.

@@ -236,7 +236,7 @@ class MeshOffFormat(MeshFormatInterpreter):
         include_textures: bool = True,
         **kwargs: Any,
     ) -> bool:
-        """Write one mesh, its normals if it was given any, its vertex colours, or its face colours of one texel.
+        """Write one mesh, its normals if it `has_verts_normals`, its vertex colours or its face colours of one texel.
 
         Args:
             data, path, path_manager: see the base class.

@@ -1,10 +1,11 @@
 """`IO`: any mesh or point cloud file, by its suffix."""
 
 from collections import deque
+from collections.abc import Iterable
 from typing import Any
 
 from rendra.common.datatypes import Device
-from rendra.io._mesh_as_cloud import MeshFileAsCloud
+from rendra.io._mesh_as_cloud import MeshFileAsCloud, cloud_of_verts
 from rendra.io._source import FileLike, PathManager
 from rendra.io.experimental_gltf_io import MeshGlbFormat
 from rendra.io.obj_io import MeshObjFormat
@@ -90,13 +91,19 @@ class IO:
             ValueError: no registered format reads this file.
             MeshFormatError: the file is malformed.
         """
+        mesh = self._read_mesh(path, include_textures, device, **kwargs)
+        if mesh is None:
+            raise ValueError(f"No mesh interpreter found to read {path}.{_known(self.mesh_interpreters)}")
+        return mesh
+
+    def _read_mesh(self, path: FileLike, include_textures: bool, device: Device, **kwargs: Any) -> Meshes | None:
         for interpreter in self.mesh_interpreters:
             mesh = interpreter.read(
                 path, include_textures=include_textures, device=device, path_manager=self.path_manager, **kwargs
             )
             if mesh is not None:
                 return mesh
-        raise ValueError(f"No mesh interpreter found to read {path}.{_known(self.mesh_interpreters)}")
+        return None
 
     def save_mesh(
         self,
@@ -147,11 +154,42 @@ class IO:
             ValueError: no registered format reads this file.
             MeshFormatError: the file is malformed.
         """
+        cloud = self._read_cloud(path, device, **kwargs)
+        if cloud is None:
+            known = _known(self.pointcloud_interpreters)
+            raise ValueError(f"No point cloud interpreter found to read {path}.{known}")
+        return cloud
+
+    def _read_cloud(self, path: FileLike, device: Device, **kwargs: Any) -> Pointclouds | None:
         for interpreter in self.pointcloud_interpreters:
             cloud = interpreter.read(path, device=device, path_manager=self.path_manager, **kwargs)
             if cloud is not None:
                 return cloud
-        raise ValueError(f"No point cloud interpreter found to read {path}.{_known(self.pointcloud_interpreters)}")
+        return None
+
+    def load_geometry(
+        self, path: FileLike, include_textures: bool = True, device: Device = "cpu", **kwargs: Any
+    ) -> Meshes | Pointclouds:
+        """Read whatever a file holds into a batch of one: a mesh, or a cloud where there are no faces.
+
+        Args:
+            path: its suffix chooses the format.
+            include_textures: read the textures of a mesh, the features of a cloud.
+            device: where the tensors go.
+            kwargs: options of the format.
+
+        Raises:
+            ValueError: no registered format reads this file.
+            MeshFormatError: the file is malformed.
+        """
+        mesh = self._read_mesh(path, include_textures, device, **kwargs)
+        if mesh is not None:
+            return cloud_of_verts(mesh) if mesh.isempty() else mesh
+        cloud = self._read_cloud(path, device, **kwargs)
+        if cloud is None:
+            known = _known([*self.mesh_interpreters, *self.pointcloud_interpreters])
+            raise ValueError(f"No mesh or point cloud interpreter found to read {path}.{known}")
+        return cloud if include_textures else Pointclouds(cloud.points_list(), normals=cloud.normals_list())
 
     def save_pointcloud(self, data: Pointclouds, path: FileLike, binary: bool | None = None, **kwargs: Any) -> None:
         """Write a batch of one point cloud.
@@ -175,7 +213,7 @@ class IO:
         )
 
 
-def _known(interpreters: deque[Any]) -> str:
+def _known(interpreters: Iterable[Any]) -> str:
     """The suffixes that would have worked."""
     suffixes = {suffix for each in interpreters for suffix in getattr(each, "known_suffixes", ())}
     return f" Registered: {', '.join(sorted(suffixes))}." if suffixes else " No format is registered."

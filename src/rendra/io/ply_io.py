@@ -282,7 +282,7 @@ class MeshPlyFormat(MeshFormatInterpreter):
         include_textures: bool = True,
         **kwargs: Any,
     ) -> bool:
-        """Write one mesh, its normals if it was given any, its vertex colours; binary unless `binary` is False.
+        """Write one mesh, its normals if it `has_verts_normals`, its vertex colours; binary unless `binary` is False.
 
         Raises:
             ValueError: the batch has not exactly one mesh.

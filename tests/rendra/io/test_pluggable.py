@@ -56,6 +56,30 @@ def test_obj_cannot_hold_an_atlas(tmp_path):
         IO().save_mesh(textured(TexturesAtlas([torch.rand(1, 2, 2, 3)])), tmp_path / "mesh.obj")
 
 
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".glb", ".xyz"])
+def test_a_file_is_read_as_what_it_holds(tmp_path, suffix):
+    cloud = Pointclouds([torch.rand(5, 3)], features=[torch.rand(5, 3)])
+    IO().save_pointcloud(cloud, tmp_path / f"cloud{suffix}")
+    back, plain = (
+        IO().load_geometry(tmp_path / f"cloud{suffix}", include_textures=wanted) for wanted in (True, False)
+    )
+    assert isinstance(back, Pointclouds)
+    assert isinstance(plain, Pointclouds)
+    assert_close(back.points_packed(), cloud.points_packed(), atol=1e-6)
+    assert_close(back.features_packed(), cloud.features_packed(), atol=0.6 / 255)
+    assert plain.features_packed() is None
+    if suffix != ".xyz":
+        IO().save_mesh(ico_sphere(0), tmp_path / f"mesh{suffix}")
+        mesh = IO().load_geometry(tmp_path / f"mesh{suffix}")
+        assert isinstance(mesh, Meshes)
+        assert len(mesh.faces_packed()) == 20
+
+
+def test_whatever_no_format_reads_is_refused_with_all_that_would_have_worked(tmp_path):
+    with pytest.raises(ValueError, match=r"No mesh or point cloud .*notes\.txt.*\.off, \.ply, \.stl, \.xyz\."):
+        IO().load_geometry(tmp_path / "notes.txt")
+
+
 def test_errors_name_the_path_and_what_would_have_worked(tmp_path):
     meshes, clouds = r"\.glb, \.gltf, \.obj, \.off, \.ply, \.stl\.", r"\.glb, \.gltf, \.obj, \.off, \.ply, \.xyz\."
     with pytest.raises(ValueError, match=rf"No mesh interpreter found to read mesh\.xyz\. Registered: {meshes}"):

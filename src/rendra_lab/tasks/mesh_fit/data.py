@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rendra.io import IO
 from rendra.ops import knn_points, sample_points_from_meshes
-from rendra.structures import Meshes
+from rendra.structures import Meshes, Pointclouds
 from rendra_lab.data.meshes import load_mesh
 from rendra_lab.data.repeated import Repeated
 from rendra_lab.errors import UserError
@@ -87,7 +87,7 @@ class ScannedCloud(LightningDataModule):
             if value < least:
                 raise UserError(f"data.{key} must be at least {least}, got {value}")
         self.path = None if path is None else Path(path)
-        self.name = name
+        self.mesh_name = name
         self.scan_points = scan_points
         self.noise = noise
         self.most = most
@@ -99,8 +99,11 @@ class ScannedCloud(LightningDataModule):
         if hasattr(self, "cloud"):
             return
         generator = torch.Generator().manual_seed(self.seed)
-        scan = self._scan(load_mesh(self.name), generator) if self.path is None else self._read(self.path, generator)
-        _check(scan, self.path or self.name)
+        if self.path is None:
+            scan = self._scan(load_mesh(self.mesh_name), generator)
+        else:
+            scan = self._read(self.path, generator)
+        _check(scan, self.path or self.mesh_name)
         self.cloud = CloudBatch.of(scan, self.most, generator)
         if len(scan) > self.most:
             log.info("%s points of %s are fitted (data.most); all of them judge", f"{self.most:,}", f"{len(scan):,}")
@@ -116,16 +119,12 @@ class ScannedCloud(LightningDataModule):
     def _read(self, path: Path, generator: torch.Generator) -> Tensor:
         if not path.is_file():
             raise UserError(f"data.path: there is no file {path}")
-        if path.suffix.lower() == ".xyz":
-            return IO().load_pointcloud(path).points_packed()
-        mesh = IO().load_mesh(path, include_textures=False)
-        return self._scan(mesh, generator) if len(mesh.faces_packed()) else mesh.verts_packed()
+        geometry = IO().load_geometry(path, include_textures=False)
+        return geometry.points_packed() if isinstance(geometry, Pointclouds) else self._scan(geometry, generator)
 
     def _scan(self, mesh: Meshes, generator: torch.Generator) -> Tensor:
-        """Points on a mesh, with noise; the global random state is left as it is."""
-        with torch.random.fork_rng([]):
-            torch.manual_seed(generator.initial_seed())
-            points = sample_points_from_meshes(mesh, self.scan_points)[0]
+        """Points (scan_points, 3) on a mesh, with noise."""
+        points = sample_points_from_meshes(mesh, self.scan_points, generator=generator)[0]
         extent = (mesh.verts_packed().amax(0) - mesh.verts_packed().amin(0)).amax()
         return points + self.noise * extent * torch.randn(points.shape, generator=generator)
 
