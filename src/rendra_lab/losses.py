@@ -6,6 +6,8 @@ Shapes: images are (B, H, W, C), masks (B, H, W), but every loss on images takes
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -96,7 +98,7 @@ def mean_square(prediction: Tensor) -> Tensor:
 
 def chamfer(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean squared distances of two clouds (B, P, 3), (B, Q, 3) to each other's nearest points, summed: a scalar."""
-    return chamfer_distance(prediction, target)[0]
+    return cast(Tensor, chamfer_distance(prediction, target)[0])
 
 
 def cloud_to_surface(mesh: Meshes, points: Tensor) -> Tensor:

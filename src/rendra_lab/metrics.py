@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rendra.loss import chamfer_distance
 from rendra.ops import knn_points, sample_points_from_meshes, self_intersections
 from rendra.structures import Meshes
 from rendra.transforms import so3_log_map
@@ -92,7 +91,7 @@ def cloud_to_surface_rms(mesh: Meshes, points: Tensor) -> Tensor:
 
 def surface_chamfer(mesh: Meshes, points: Tensor) -> Tensor:
     """Mean squared distances between 10,000 points of a surface and a cloud (1, P, 3), both ways, summed."""
-    return chamfer_distance(_samples(mesh), points)[0]
+    return losses.chamfer(_samples(mesh), points)
 
 
 def surface_f_score(mesh: Meshes, points: Tensor, threshold: float) -> Tensor:
@@ -108,16 +107,30 @@ def surface_f_score(mesh: Meshes, points: Tensor, threshold: float) -> Tensor:
     return 2 * precision * recall / (precision + recall).clamp_min(1e-12)
 
 
+def displacement_error(displacement: Tensor, truth: Tensor) -> Tensor:
+    """The Euclidean distance of estimated displacements (B, 3) from the true ones, the mean over the batch."""
+    return (displacement - truth).norm(dim=1).mean()
+
+
+def estimated_coordinate(vector: Tensor, axis: int) -> Tensor:
+    """One coordinate of estimated vectors (B, 3), the mean over the batch: axis 0, 1 or 2."""
+    return vector[:, axis].mean()
+
+
+def true_coordinate(vector: Tensor, truth: Tensor, axis: int) -> Tensor:
+    """One coordinate of true vectors (B, 3), to stand beside the estimate's."""
+    return truth[:, axis].mean()
+
+
 def num_self_intersections(mesh: Meshes) -> Tensor:
     """How many pairs of a surface's faces cross each other."""
     return torch.tensor(float(len(self_intersections(mesh))), device=mesh.device)
 
 
 def _samples(mesh: Meshes) -> Tensor:
-    """Points on a surface (1, 10,000, 3), the same at every call; the random state is left as it is."""
-    with torch.random.fork_rng([mesh.device] if mesh.device.type == "cuda" else []):
-        torch.manual_seed(0)
-        return sample_points_from_meshes(mesh, _SURFACE_SAMPLES)
+    """Points on a surface (1, 10,000, 3), the same at every call."""
+    generator = torch.Generator(mesh.device).manual_seed(0)
+    return sample_points_from_meshes(mesh, _SURFACE_SAMPLES, generator=generator)
 
 
 def _batched(prediction: Tensor, target: Tensor, dims: int = 4) -> tuple[Tensor, Tensor]:

@@ -119,6 +119,13 @@ def slab(thickness: float) -> Meshes:
     return Meshes([torch.cat([top, bottom])], [torch.cat([up, down + len(top)])])
 
 
+def test_displacements_are_measured_and_shown_by_coordinate() -> None:
+    estimate, truth = torch.tensor([[3.0, 4.0, 5.0]]), torch.tensor([[0.0, 4.0, 1.0]])
+    assert metrics.displacement_error(estimate, truth) == 5
+    assert [metrics.estimated_coordinate(estimate, axis) for axis in range(3)] == [3, 4, 5]
+    assert [metrics.true_coordinate(estimate, truth, axis) for axis in range(3)] == [0, 4, 1]
+
+
 def test_distances_from_a_surface_are_squared_and_averaged() -> None:
     verts, faces = plate(0.0)
     points = torch.tensor([[[0.31, 0.47, 2.0], [0.5, 0.5, -1.0], [2.0, 0.5, 0.0]]])

@@ -9,11 +9,10 @@ from assertions import assert_close
 from far_device import Far, far  # noqa: F401
 
 from rendra.io import IO
-from rendra_lab import losses, visualization
+from rendra_lab import losses, metrics, visualization
 from rendra_lab.errors import UserError
 from rendra_lab.experiment import run
 from rendra_lab.tasks.localize.data import Looks, SeenSolids
-from rendra_lab.tasks.localize.scores import displacement_error, estimated_coordinate, true_coordinate
 from rendra_lab.tasks.localize.solids import SOLIDS, subdivided
 from rendra_lab.tasks.localize.task import Localize
 from rendra_lab.tasks.localize.views import picture
@@ -144,13 +143,6 @@ def test_a_missing_file_is_named():
         seen(paths=["nowhere.obj"])
 
 
-def test_scores():
-    estimate, truth = torch.tensor([[3.0, 4.0, 5.0]]), torch.tensor([[0.0, 4.0, 1.0]])
-    assert displacement_error(estimate, truth) == 5
-    assert [estimated_coordinate(estimate, axis) for axis in range(3)] == [3, 4, 5]
-    assert [true_coordinate(estimate, truth, axis) for axis in range(3)] == [0, 4, 1]
-
-
 def test_the_camera_of_a_picture_stands_still():
     data = seen(samples=300)
     first, second = (data.look(number) for number in range(2))
@@ -176,7 +168,7 @@ def test_a_fit_stays_where_its_batch_lies(far):  # noqa: F811
     batch = seen(samples=20, measurements=0).look(0).to(far)
     task = Localize(
         losses={"chamfer": LossTerm(losses.chamfer, 1.0, "samples", "points")},
-        metrics={"error": MetricTerm(displacement_error, "displacement", "displacement")},
+        metrics={"error": MetricTerm(metrics.displacement_error, "displacement", "displacement")},
         optimizer=partial(torch.optim.SGD, lr=0.25),
     )
     task.displacement = torch.nn.Parameter(task.displacement.detach().to(far))
