@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -23,8 +24,17 @@ class TensorRecord:
     """Base of frozen dataclasses whose fields are tensors, records, containers of them, or have a `.to`.
 
     Subclass with `@dataclass(frozen=True)` and annotate the fields with their shapes. Fields that cannot move
-    (strings, numbers, None) pass through unchanged.
+    (strings, numbers, None) pass through unchanged. A field that would hide a method of this class, such as one
+    called `names`, is a TypeError where the subclass is defined.
     """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        taken = [name for name in inspect.get_annotations(cls) if hasattr(TensorRecord, name)]
+        if taken:
+            raise TypeError(
+                f"{cls.__name__}.{taken[0]} would hide TensorRecord.{taken[0]}: give the field another name"
+            )
 
     def to(self: RecordT, *args: Any, **kwargs: Any) -> RecordT:
         """The same record on another device or in another dtype; the arguments are those of `Tensor.to`."""

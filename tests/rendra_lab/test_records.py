@@ -82,3 +82,9 @@ def test_named_tuples_stay_what_they_are() -> None:
     moved = Holder(Pair(torch.ones(2), torch.zeros(2))).to(torch.float64)
     assert isinstance(moved.pair, Pair)
     assert moved.pair.left.dtype == torch.float64
+
+
+@pytest.mark.parametrize("name", ["names", "to", "detach", "stack", "batch_size"])
+def test_a_field_that_would_hide_a_method_is_refused(name: str) -> None:
+    with pytest.raises(TypeError, match=f"Hiding.{name} would hide TensorRecord.{name}"):
+        type("Hiding", (TensorRecord,), {"__annotations__": {name: Tensor}})
