@@ -242,7 +242,7 @@ def wrong_normals(mesh: Meshes) -> Tensor:
 
     The mean is weighted by area; vertices without faces, and meshes that store no normals, have none wrong.
     """
-    if mesh._normals is None:
+    if not mesh.has_given_normals:
         return torch.zeros(len(mesh.verts_packed()), dtype=torch.bool, device=mesh.device)
     faces, crosses = mesh.faces_packed(), _crosses(mesh)
     mean = torch.zeros_like(mesh.verts_packed(), dtype=torch.float64)

@@ -264,7 +264,7 @@ def _finite_part(mesh: Meshes, finite: Tensor) -> Meshes:
     """The faces whose vertices are all finite; the others are 0 and unused."""
     faces = mesh.faces_packed()
     verts = mesh.verts_packed().masked_fill(~finite[:, None], 0.0)
-    normals = [mesh.verts_normals_packed()] if mesh.has_verts_normals() else None
+    normals = [mesh.verts_normals_packed()] if mesh.has_given_normals else None
     return Meshes([verts], [faces[finite[faces].all(1)]], verts_normals=normals)
 
 
@@ -277,7 +277,7 @@ def _stored_normals(asset: Asset, mesh: Meshes) -> tuple[str, int]:
     if corners is not None and asset.mesh is not None:
         faces = asset.mesh.faces_normals_packed()[:, None]
         return "corners", int(((corners * faces).sum(-1) < 0).sum())
-    if mesh._normals is None:
+    if not mesh.has_given_normals:
         return "none", 0
     return "vertices", int(quality.wrong_normals(mesh).sum())
 

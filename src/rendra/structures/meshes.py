@@ -297,6 +297,11 @@ class Meshes:
         """Whether vertex normals were given, or computed before."""
         return self._normals is not None or "verts_normals" in self._derived
 
+    @property
+    def has_given_normals(self) -> bool:
+        """Whether vertex normals were given; what is computed from the faces does not count."""
+        return self._normals is not None
+
     def _verts_normals(self) -> Ragged:
         if self._normals is not None:
             return self._normals

@@ -194,7 +194,12 @@ def test_given_normals_are_kept() -> None:
     assert not mesh.offset_verts(torch.rand(7, 3)).has_verts_normals()
     padded = Meshes(SQUARE_VERTS[None], SQUARE_FACES[None], verts_normals=normals[0][None])
     assert torch.equal(padded.verts_normals_list()[0], normals[0])
-    assert not Meshes([SQUARE_VERTS], [SQUARE_FACES]).has_verts_normals()
+    bare = Meshes([SQUARE_VERTS], [SQUARE_FACES])
+    assert not bare.has_verts_normals()
+    bare.verts_normals_packed()
+    assert bare.has_verts_normals()
+    assert mesh.has_given_normals
+    assert not bare.has_given_normals
 
 
 def test_rows_with_padding_are_dropped_from_lists() -> None:
