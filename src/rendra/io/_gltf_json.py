@@ -3,8 +3,11 @@
 Positions in errors read like `meshes[2].primitives[0].mode`.
 """
 
+import contextlib
+import gc
 import json
 import math
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import numpy as np
@@ -13,6 +16,7 @@ import numpy.typing as npt
 from rendra.io.errors import MeshFormatError
 
 _LARGEST_EXACT = 1 << 53  # beyond it a JSON number may not be the integer that was meant
+_MOST_ITEMS = 1 << 16  # of one list; each takes some 20 microseconds and a quarter of a kilobyte
 _MISSING: Any = object()
 
 
@@ -39,7 +43,8 @@ def parse_json(data: bytes, name: str, offset: int, what: str = "the JSON") -> d
         why = f"{what} is not UTF-8 at byte {offset + error.start}"
         raise MeshFormatError(why, name, expected="UTF-8 text") from error
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
+        with _without_collector():
+            value = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         near = text[error.pos : error.pos + 40]
         place = f" at byte {offset + len(text[: error.pos].encode())}" if offset else ""
@@ -53,6 +58,18 @@ def parse_json(data: bytes, name: str, offset: int, what: str = "the JSON") -> d
     if not isinstance(value, dict):
         raise MeshFormatError(f"{what} is no object", name, found=text[:40], expected="{...}")
     return value
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """No search for circles, which JSON cannot have, and which takes most of the time of a million lists."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -76,6 +93,8 @@ class Item:
         where: its position, "" for the whole document.
         file: name of the file.
     """
+
+    __slots__ = ("_value", "file", "where")
 
     def __init__(self, value: dict[str, Any], where: str, file: str) -> None:
         self._value, self.where, self.file = value, where, file
@@ -149,10 +168,12 @@ class Item:
         return Item(value, f"{self.where}.{key}".lstrip("."), self.file)
 
     def items(self, key: str) -> "list[Item]":
-        """A list of objects; none where the field is missing."""
+        """A list of at most 65,536 objects; none where the field is missing."""
         place = f"{self.where}.{key}".lstrip(".")
-        found = []
-        for i, value in enumerate(self._list(key)):
+        found, values = [], self._list(key)
+        if len(values) > _MOST_ITEMS:
+            self.fail(key, "is too long", f"{len(values):,} entries", f"at most {_MOST_ITEMS:,}")
+        for i, value in enumerate(values):
             if not isinstance(value, dict):
                 self.fail(f"{key}[{i}]", "is no object", value, "{...}")
             found.append(Item(value, f"{place}[{i}]", self.file))
@@ -160,8 +181,11 @@ class Item:
 
     def indices(self, key: str, count: int, of: str) -> list[int]:
         """References to `count` things called `of`; none where the field is missing."""
-        values = Item({str(i): each for i, each in enumerate(self._list(key))}, f"{self.where}.{key}", self.file)
-        return [values.index(number, count, of) or 0 for number in values._value]
+        values = self._list(key)
+        for i, value in enumerate(values):
+            if type(value) is not int or not 0 <= value < count:
+                Item({str(i): value}, f"{self.where}.{key}", self.file).index(str(i), count, of)
+        return [int(value) for value in values]
 
     def texts(self, key: str) -> list[str]:
         """A list of strings; none where the field is missing."""

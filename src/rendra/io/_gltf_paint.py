@@ -1,6 +1,7 @@
 """One texture for all parts of a glTF scene."""
 
 import warnings
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from rendra.io._images import MAX_TEXTURE_PIXELS
 from rendra.io.errors import MeshFormatError
 from rendra.renderer.mesh.texture_packing import Sampling, pack_maps
 from rendra.renderer.mesh.textures import TexturesBase, TexturesUV, TexturesVertex
+from rendra.renderer.mesh.utils import pack_rectangles
 
 
 def paint(parts: list[Part], pictures: Pictures, name: str) -> TexturesBase | None:
@@ -94,6 +96,8 @@ def _uv_texture(parts: list[Part], images: list[Tensor | None], name: str) -> Te
 def _patches(parts: list[Part], images: list[Tensor | None], name: str) -> list[_Patch]:
     """What each part with faces reads; parts of one image and one factor share it."""
     tinted: dict[tuple[int, tuple[float, ...] | None], Tensor] = {}
+    uses = {(id(image), part.material.factor) for part, image in zip(parts, images, strict=True)}
+    tints = Counter(image for image, _ in uses)
     patches, pixels = [], 0
     for part, image in zip(parts, images, strict=True):
         if image is None:
@@ -107,7 +111,7 @@ def _patches(parts: list[Part], images: list[Tensor | None], name: str) -> list[
                 raise MeshFormatError(
                     "the images, in all their tints, are too large", name, None, f"{pixels:,}", limit
                 )
-            tinted[key] = _tinted(image, part.material)
+            tinted[key] = _tinted(image, part.material, in_place=tints[id(image)] == 1)
         patches.append(_Patch(tinted[key], *_unrolled(part, name)))
     return patches
 
@@ -119,10 +123,11 @@ def _sampling(textures: list[Texture]) -> Sampling:
     return Sampling("reflection" if mirrored else "border", True, "nearest" if nearest else "bilinear")
 
 
-def _tinted(image: Tensor, material: Material) -> Tensor:
+def _tinted(image: Tensor, material: Material, in_place: bool) -> Tensor:
     if material.factor is None or material.factor == (1.0, 1.0, 1.0):
         return image
-    return image * torch.tensor(material.factor, dtype=image.dtype)
+    factor = torch.tensor(material.factor, dtype=image.dtype)
+    return image.mul_(factor) if in_place else image * factor
 
 
 def _plain_patch(part: Part, name: str) -> _Patch:
@@ -146,10 +151,9 @@ def _unrolled(part: Part, name: str) -> tuple[Floats, Positions]:
     if not outside.any():
         return uvs, faces
     tiles = np.where(outside, np.floor(corners.min(axis=1)), 0.0)  # (F, 2)
-    keys = np.concatenate([faces.reshape(-1, 1), np.repeat(tiles, 3, axis=0)], axis=1)
-    rows, index = np.unique(keys, axis=0, return_inverse=True)
-    moved = (uvs[rows[:, 0].astype(np.int64)] - rows[:, 1:]).astype(np.float32)
-    index = index.reshape(-1, 3).astype(np.int64)
+    rows, shifts, index = _distinct(faces.ravel(), np.repeat(tiles, 3, axis=0))
+    moved = (uvs[rows] - shifts).astype(np.float32)
+    index = index.reshape(-1, 3)
     crossing = int(((moved[index] > 1.0).any(axis=1) & repeats).any(axis=1).sum())
     if crossing:
         why = "cross the border of a repeated texture, which is continued with its last texels instead"
@@ -157,8 +161,29 @@ def _unrolled(part: Part, name: str) -> tuple[Floats, Positions]:
     return moved, index
 
 
+def _distinct(rows: Positions, tiles: Floats) -> tuple[Positions, Floats, Positions]:
+    """The different pairs of a row (C,) and a tile (C, 2), in their order, and which of them each corner has."""
+    order = np.lexsort((tiles[:, 1], tiles[:, 0], rows))
+    rows, tiles = rows[order], tiles[order]
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = (rows[1:] != rows[:-1]) | (tiles[1:] != tiles[:-1]).any(axis=1)
+    index = np.empty(len(rows), dtype=np.int64)
+    index[order] = np.cumsum(first) - 1
+    return rows[first], tiles[first], index
+
+
+def _demand_room(images: list[Tensor], name: str) -> None:
+    """Refuse images that take too much memory together with the one that they are copied into."""
+    sizes = [(image.shape[1], image.shape[0]) for image in {id(image): image for image in images}.values()]
+    width, height = pack_rectangles(sizes).total_size
+    if width * height + sum(columns * rows for columns, rows in sizes) > MAX_TEXTURE_PIXELS:
+        limit = f"half of {MAX_TEXTURE_PIXELS:,} pixels, or include_textures=False"
+        raise MeshFormatError("the images side by side are too large", name, None, f"{width:,} x {height:,}", limit)
+
+
 def _packed(patches: list[_Patch], sampling: Sampling, name: str) -> tuple[Tensor, list[Floats]]:
     """All images side by side, and each part's coordinates in it."""
+    _demand_room([patch.image for patch in patches], name)
     inside = [patch.uvs.clip(0.0, 1.0) for patch in patches]
     if any(
         (patch.uvs[patch.faces_uvs] != uvs[patch.faces_uvs]).any() for patch, uvs in zip(patches, inside, strict=True)

@@ -9,19 +9,19 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from rendra.io._bulk_text import Positions
 from rendra.io._gltf_asset import BYTE, FLOAT, SHORT, UBYTE, UINT, USHORT, Asset, Floats
 from rendra.io._gltf_json import Item
 from rendra.io._gltf_materials import Material, read_material
-from rendra.io._gltf_scene import Instance, instances
+from rendra.io._gltf_scene import Instance, Matrix, instances
 from rendra.io.errors import MeshFormatError
 
 EXACT_V = "_RENDRA_V"  # v from the bottom left, where 1 - v has lost its last bits
 VERTEX_NUMBER = "_RENDRA_VERTEX"  # which vertex a row is a copy of: two 16-bit halves, the lower first
 
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_MOST_PARTS = 1 << 14  # each takes up to 0.2 ms
 _FREE_ROWS = 1 << 22  # vertices and corners that any file may show; beyond it, one for each of its bytes
 
 
@@ -65,8 +65,10 @@ class _Reader:
     def __init__(self, asset: Asset) -> None:
         self._asset = asset
         self._rows, self._limit = 0, _FREE_ROWS
+        self._parts = 0
         self._meshes: dict[int, list[Part]] = {}
-        self._cost: dict[int, int] = {}
+        self._cost: dict[int, tuple[int, int]] = {}
+        self._materials: dict[int, Material] = {}
         self._lines = 0
         self._bent: set[str] = set()
 
@@ -83,11 +85,20 @@ class _Reader:
         return parts
 
     def _charge(self, instance: Instance) -> None:
-        """Add up the rows that the scene will have, before any of them is read."""
+        """Add up the parts and rows that the scene will have, before any of them is read."""
         if instance.mesh not in self._cost:
             primitives = self._asset.meshes[instance.mesh].items("primitives")
-            self._cost[instance.mesh] = sum(map(self._rows_of, primitives))
-        self._rows += self._cost[instance.mesh]
+            self._cost[instance.mesh] = len(primitives), sum(map(self._rows_of, primitives))
+        parts, rows = self._cost[instance.mesh]
+        self._parts += parts
+        self._rows += rows
+        if self._parts > _MOST_PARTS:
+            self._asset.meshes[instance.mesh].fail(
+                None,
+                "the scene shows too many primitives",
+                f"{self._parts:,} up to {instance.node}",
+                f"at most {_MOST_PARTS:,}",
+            )
         if self._rows > self._limit:
             self._limit = max(_FREE_ROWS, self._asset.size())
         if self._rows > self._limit:
@@ -132,9 +143,15 @@ class _Reader:
             self._bent.add("morph targets")
         if primitive.extension("KHR_draco_mesh_compression") is not None and "POSITION" not in attributes:
             primitive.fail(None, "Draco compression is not supported", expected="plain accessors")
-        material_number = primitive.index("material", len(self._asset.materials), "materials")
-        material = Material(None, None) if material_number is None else read_material(self._asset, material_number)
-        return self._read_arrays(primitive, attributes, mode, material)
+        return self._read_arrays(primitive, attributes, mode, self._read_material(primitive))
+
+    def _read_material(self, primitive: Item) -> Material:
+        number = primitive.index("material", len(self._asset.materials), "materials")
+        if number is None:
+            return Material(None, None)
+        if number not in self._materials:
+            self._materials[number] = read_material(self._asset, number)
+        return self._materials[number]
 
     def _read_arrays(self, primitive: Item, attributes: Item, mode: int, material: Material) -> Part | None:
         small = (BYTE, UBYTE, SHORT, USHORT)
@@ -294,19 +311,24 @@ def _placed(part: Part, instance: Instance, file: str) -> Part:
         verts = (part.verts @ linear.T + shift).astype(np.float32)
     if not np.isfinite(verts).all():
         raise MeshFormatError(f"{instance.node}: the transform takes vertices out of single precision", file)
-    normals = None if part.normals is None else _turned(part.normals, linear)
-    if np.linalg.det(linear) >= 0.0:
+    cofactors, determinant = _cofactors(linear)
+    normals = None if part.normals is None else _turned(part.normals, cofactors if determinant >= 0.0 else -cofactors)
+    if determinant >= 0.0:
         return replace(part, verts=verts, normals=normals)
     flip = [0, 2, 1]  # a mirror turns faces inside out
     return replace(part, verts=verts, normals=normals, faces=part.faces[:, flip], faces_uvs=part.faces_uvs[:, flip])
 
 
-def _turned(normals: Floats, linear: npt.NDArray[np.float64]) -> Floats:
-    """Normals under a linear map: by its cofactors, which are its inverse transposed but for a factor."""
-    a, b, c = linear.T  # columns
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    if np.linalg.det(linear) < 0.0:
-        cofactors = -cofactors
+def _cofactors(linear: Matrix) -> tuple[Matrix, float]:
+    """The inverse of (3, 3), transposed, times the determinant; and the determinant."""
+    (a, b, c), (d, e, f), (g, h, i) = linear.tolist()
+    first = (e * i - f * h, f * g - d * i, d * h - e * g)
+    rest = ((c * h - b * i, a * i - c * g, b * g - a * h), (b * f - c * e, c * d - a * f, a * e - b * d))
+    return np.array([first, *rest]), a * first[0] + b * first[1] + c * first[2]
+
+
+def _turned(normals: Floats, cofactors: Matrix) -> Floats:
+    """Unit normals under a linear map, by its cofactors."""
     largest = np.abs(cofactors).max()
     turned = normals @ (cofactors / largest if largest else cofactors).T
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)

@@ -1,5 +1,6 @@
 """Where the meshes of a glTF scene stand: the node tree, walked without recursion."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,19 +89,24 @@ def _local(node: Item) -> Matrix:
             node.fail("matrix", "is no affine transform", matrix[3].tolist(), "0, 0, 0, 1 as the last row")
         return matrix
     local = np.eye(4)
-    local[:3, :3] = _rotation(node) * node.numbers("scale", [1.0, 1.0, 1.0])
-    local[:3, 3] = node.numbers("translation", [0.0, 0.0, 0.0])
+    if "rotation" in node:
+        local[:3, :3] = _rotation(node)
+    if "scale" in node:
+        local[:3, :3] *= node.numbers("scale", [1.0, 1.0, 1.0])
+    if "translation" in node:
+        local[:3, 3] = node.numbers("translation", [0.0, 0.0, 0.0])
     return local
 
 
 def _rotation(node: Item) -> Matrix:
     """(3, 3) of the unit quaternion x, y, z, w, made one where it is not quite."""
-    quaternion = node.numbers("rotation", [0.0, 0.0, 0.0, 1.0])
-    largest = np.abs(quaternion).max()
-    if largest == 0.0:
+    quaternion = node.numbers("rotation", [0.0, 0.0, 0.0, 1.0]).tolist()
+    length = math.hypot(*quaternion)
+    if length == 0.0:
         node.fail("rotation", "is a quaternion of length 0", expected="a unit quaternion")
-    quaternion = quaternion / largest  # so that squares neither vanish nor overflow
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    if math.isinf(length):
+        node.fail("rotation", "is no unit quaternion", quaternion, "a unit quaternion")
+    x, y, z, w = (each / length for each in quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -31,7 +31,8 @@ def decode_image(data: bytes, name: str) -> Tensor:
             warnings.simplefilter("ignore")  # of Pillow's own, laxer limit and of odd metadata
             with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
                 _demand_size(image, name)
-                pixels = _rgb(ImageOps.exif_transpose(image))
+                ImageOps.exif_transpose(image, in_place=True)
+                pixels = _rgb(image)
     except MeshFormatError:
         raise
     except Image.DecompressionBombError as error:

@@ -26,6 +26,52 @@ def glb_of_nodes(nodes: list[dict]) -> bytes:
     return pack_glb({**document, "nodes": [*nodes, {"mesh": 0}]}, body)
 
 
+def glb_of_parts(primitives: int, nodes: int, materials: int, images: int) -> bytes:
+    """Textured triangles: so many a mesh, which every node shows elsewhere, each with a tint and an image of its own.
+
+    Materials and images begin again at their first when they run out.
+    """
+    document, body = gltf_parts(textured=True)
+    (primitive,) = document["meshes"][0]["primitives"]
+    info = {"extensions": {"KHR_texture_transform": {"rotation": 1, "scale": [2, 3]}}}
+    document |= {
+        "meshes": [{"primitives": [{**primitive, "material": i % materials} for i in range(primitives)]}],
+        "nodes": [{"mesh": 0, "translation": [i, 2, 3], "scale": [1, -1, 2]} for i in range(nodes)],
+        "scenes": [{"nodes": list(range(nodes))}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": [i / materials, 1, 0, 1],
+                    "baseColorTexture": {"index": i % images, **info},
+                }
+            }
+            for i in range(materials)
+        ],
+        "textures": [{"source": i} for i in range(images)],
+        "images": document["images"] * images,
+    }
+    return pack_glb(document, body)
+
+
+def glb_of_images(*sizes: tuple[int, int]) -> bytes:
+    """One textured triangle for each image, all black."""
+    document, body = gltf_parts(textured=True)
+    (primitive,) = document["meshes"][0]["primitives"]
+    document["meshes"][0]["primitives"] = [{**primitive, "material": i} for i in range(len(sizes))]
+    document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": i}}} for i in range(len(sizes))]
+    document["textures"] = [{"source": i} for i in range(len(sizes))]
+    document["images"] = []
+    for size in sizes:
+        buffer = io.BytesIO()
+        Image.new("1", size).save(buffer, "PNG")
+        document["images"].append({"bufferView": len(document["bufferViews"]), "mimeType": "image/png"})
+        view = {"buffer": 0, "byteOffset": len(body), "byteLength": len(buffer.getvalue())}
+        document["bufferViews"].append(view)
+        body += buffer.getvalue()
+    document["buffers"] = [{"byteLength": len(body)}]
+    return pack_glb(document, body)
+
+
 OBJ_TEXTS = {
     "a number that is none": ("v 0 0 " + "9" * 2 * M + "x\n", "cannot read '9999"),
     "a number of ten megabytes": ("v 0 0 0." + "9" * 10 * M + "\n", None),
@@ -119,6 +165,16 @@ MESH_BYTES = {
     "glb, an endless number": ("glb", pack_glb(b'{"asset":' + b"9" * M + b"}"), "malformed"),
     "glb, doubled at each node": ("glb", glb_of_nodes([{"children": [i + 1] * 2} for i in range(50)]), "two parents"),
     "glb, a ring of nodes": ("glb", glb_of_nodes([{"children": [1]}, {"children": [0]}]), "its own ancestor"),
+    "glb, lists without end": ("glb", pack_glb(b'{"asset":{"version":"2.0"},"x":[' + b"[0]," * M + b"0]}"), None),
+    "glb, nodes without end": ("glb", glb_of_nodes([{}] * 70_000), "nodes: is too long; found '70,001 entries'"),
+    "glb, children without end": ("glb", glb_of_nodes([{"children": [1] * M}, {}]), "two parents"),
+    "glb, empty materials without end": (
+        "glb", pack_glb(b'{"asset":{"version":"2.0"},"materials":[' + b"{}," * M + b"{}]}"), "materials: is too long",
+    ),
+    "glb, primitives without end": ("glb", glb_of_parts(17_000, 1, 1, 1), "too many primitives; found '17,000"),
+    "glb, a mesh at every node": ("glb", glb_of_parts(130, 200, 1, 1), "too many primitives; found '16,510 up to n"),
+    "glb, parts, tints and images": ("glb", glb_of_parts(500, 2, 500, 100), None),
+    "glb, images that do not fit": ("glb", glb_of_images((9000, 2), (2, 9000)), "side by side are too large"),
 }  # fmt: skip
 
 

@@ -128,6 +128,8 @@ def _box_of(image: Tensor, uvs: Tensor, sampling: Sampling) -> _Box:
 
 def _padded_map(image: Tensor, box: _Box, sampling: Sampling) -> Tensor:
     """The texels of `box`, those outside of the image by the padding mode."""
+    if box == _Box(0, image.shape[1], 0, image.shape[0]):
+        return image
     rows = torch.arange(box.top, box.bottom, device=image.device)
     columns = torch.arange(box.left, box.right, device=image.device)
     height, width = image.shape[:2]
