@@ -25,11 +25,12 @@ NAMES = {
         hat hat_inv so3_exp_map so3_exponential_map so3_log_map so3_relative_angle so3_rotation_angle""",
     "rendra.transforms.transform3d": "Rotate RotateAxisAngle Scale Transform3d Translate",
     "rendra.structures": """
-        Meshes Pointclouds join_meshes_as_batch join_meshes_as_scene join_pointclouds_as_batch
+        Meshes Pointclouds Volumes join_meshes_as_batch join_meshes_as_scene join_pointclouds_as_batch
         join_pointclouds_as_scene list_to_packed list_to_padded packed_to_list padded_to_list""",
     "rendra.structures.meshes": "Meshes join_meshes_as_batch join_meshes_as_scene",
     "rendra.structures.pointclouds": "Pointclouds join_pointclouds_as_batch join_pointclouds_as_scene",
     "rendra.structures.utils": "list_to_packed list_to_padded packed_to_list padded_to_list padded_to_packed",
+    "rendra.structures.volumes": "VolumeLocator Volumes",
     "rendra.io": "IO load_obj load_objs_as_meshes load_ply save_obj save_ply",
     "rendra.io.experimental_gltf_io": "MeshGlbFormat",
     "rendra.io.mtl_io": "load_mtl make_mesh_texture_atlas",
@@ -39,6 +40,7 @@ NAMES = {
     "rendra.io.pluggable_formats": "MeshFormatInterpreter PointcloudFormatInterpreter",
     "rendra.io.ply_io": "MeshPlyFormat PointcloudPlyFormat load_ply save_ply",
     "rendra.ops": """
+        add_pointclouds_to_volumes add_points_features_to_volume_densities_features
         GraphConv SubdivideMeshes ball_query box3d_overlap convert_pointclouds_to_tensor
         corresponding_points_alignment cot_laplacian cubify efficient_pnp estimate_pointcloud_local_coord_frames
         estimate_pointcloud_normals eyes get_point_covariances interpolate_face_attributes is_pointclouds
@@ -60,6 +62,8 @@ NAMES = {
     "rendra.ops.points_alignment": """
         ICPSolution SimilarityTransform corresponding_points_alignment iterative_closest_point""",
     "rendra.ops.points_normals": "estimate_pointcloud_local_coord_frames estimate_pointcloud_normals",
+    "rendra.ops.points_to_volumes": """
+        add_pointclouds_to_volumes add_points_features_to_volume_densities_features""",
     "rendra.ops.sample_farthest_points": "sample_farthest_points sample_farthest_points_naive",
     "rendra.ops.sample_points_from_meshes": "sample_points_from_meshes",
     "rendra.ops.subdivide_meshes": "SubdivideMeshes",
@@ -192,6 +196,17 @@ SIGNATURES = {
         "join_pointclouds_as_batch": "pointclouds",
         "join_pointclouds_as_scene": "pointclouds",
     },
+    "rendra.structures.volumes": {
+        "Volumes": """densities, features=None, voxel_size=1.0, volume_translation=(0.0, 0.0, 0.0),
+            align_corners=True""",
+        "Volumes.to": "self, device, copy=False",
+        "Volumes.update_padded": "self, new_densities, new_features=None",
+        "Volumes.get_coord_grid": "self, world_coordinates=True",
+        "Volumes.local_to_world_coords": "self, points_3d_local",
+        "Volumes.world_to_local_coords": "self, points_3d_world",
+        "VolumeLocator": """batch_size, grid_sizes, device, voxel_size=1.0, volume_translation=(0.0, 0.0, 0.0),
+            align_corners=True""",
+    },
     "rendra.structures.utils": {
         "list_to_padded": "x, pad_size=None, pad_value=0.0, equisized=False",
         "padded_to_list": "x, split_size=None",
@@ -265,6 +280,13 @@ SIGNATURES = {
         "knn_points": """p1, p2, lengths1=None, lengths2=None, norm=2, K=1, version=-1, return_nn=False,
             return_sorted=True""",
         "knn_gather": "x, idx, lengths=None",
+    },
+    "rendra.ops.points_to_volumes": {
+        "add_pointclouds_to_volumes": """pointclouds, initial_volumes, mode='trilinear', min_weight=1e-4,
+            rescale_features=True""",
+        "add_points_features_to_volume_densities_features": """points_3d, points_features, volume_densities,
+            volume_features, mode='trilinear', min_weight=1e-4, mask=None, grid_sizes=None, rescale_features=True,
+            align_corners=True""",
     },
     "rendra.loss.mesh_edge_loss": {"mesh_edge_loss": "meshes, target_length=0.0"},
     "rendra.loss.mesh_laplacian_smoothing": {"mesh_laplacian_smoothing": "meshes, method='uniform'"},
@@ -412,6 +434,13 @@ METHODS = {
         features_packed features_padded get_bounding_boxes get_cloud inside_box isempty normals_list normals_packed
         normals_padded num_points_per_cloud offset offset_ packed_to_cloud_idx padded_to_packed_idx points_list
         points_packed points_padded scale scale_ split subsample to update_padded valid __getitem__ __len__""",
+    "rendra.structures.Volumes": """
+        clone cpu cuda densities densities_list device features features_list get_align_corners get_coord_grid
+        get_grid_sizes get_local_to_world_coords_transform get_world_to_local_coords_transform local_to_world_coords
+        to update_padded world_to_local_coords __getitem__ __len__""",
+    "rendra.structures.volumes.VolumeLocator": """
+        clone get_coord_grid get_grid_sizes get_local_to_world_coords_transform get_world_to_local_coords_transform
+        local_to_world_coords world_to_local_coords __getitem__""",
     "rendra.renderer.CamerasBase": """
         clone get_camera_center get_full_projection_transform get_image_size get_ndc_camera_transform
         get_projection_transform get_world_to_view_transform get_znear in_ndc is_perspective to transform_points

@@ -14,6 +14,7 @@ from rendra.ops.packed_to_padded import packed_to_padded, padded_to_packed
 from rendra.ops.perspective_n_points import efficient_pnp
 from rendra.ops.points_alignment import corresponding_points_alignment, iterative_closest_point
 from rendra.ops.points_normals import estimate_pointcloud_local_coord_frames, estimate_pointcloud_normals
+from rendra.ops.points_to_volumes import add_pointclouds_to_volumes, add_points_features_to_volume_densities_features
 from rendra.ops.sample_farthest_points import sample_farthest_points
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
 from rendra.ops.self_intersections import self_intersections
@@ -32,6 +33,8 @@ __all__ = [
     "GraphConv",
     "SubdivideMeshes",
     "SurfacePoints",
+    "add_pointclouds_to_volumes",
+    "add_points_features_to_volume_densities_features",
     "ball_query",
     "box3d_overlap",
     "convert_pointclouds_to_tensor",

@@ -9,10 +9,13 @@ from rendra.structures.utils import (
     padded_to_list,
     padded_to_packed,
 )
+from rendra.structures.volumes import VolumeLocator, Volumes
 
 __all__ = [
     "Meshes",
     "Pointclouds",
+    "VolumeLocator",
+    "Volumes",
     "join_meshes_as_batch",
     "join_meshes_as_scene",
     "join_pointclouds_as_batch",
