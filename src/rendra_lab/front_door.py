@@ -53,14 +53,14 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
         config_dir = Path(script).resolve().parent / config_path
-        mistyped = None if verbose or isinstance(error, _MISTAKES) else mistyped_value(config_dir, config_name)
+        clear = isinstance(error, _MISTAKES) and not isinstance(error, InstantiationException)
+        mistyped = None if verbose or clear else mistyped_value(config_dir, config_name)
         if verbose or not (mistyped or isinstance(error, _WORDED)):
             raise
         message = mistyped or explain(error, config_dir, config_name)
         sys.stderr.write(f"{Path(script).name}: {message}\n")
         before_the_run = FailureKeeper.failure is None
-        is_mistake = before_the_run or mistyped or isinstance(error, _MISTAKES)
-        sys.exit(_EXIT_MISTAKE if is_mistake else _EXIT_FAILURE)
+        sys.exit(_EXIT_MISTAKE if before_the_run or mistyped or _is_mistake(error) else _EXIT_FAILURE)
     except BaseException:  # an interrupted sweep has its table too
         conclude_sweep()
         raise
@@ -81,6 +81,13 @@ class FailureKeeper(Callback):
             FailureKeeper.failure = job_return._return_value
             job_return.return_value = None
             job_return.status = JobStatus.COMPLETED
+
+
+def _is_mistake(error: Exception) -> bool:
+    """Whether a run failed over what it was given: a setting, or a file that is malformed or not there."""
+    from rendra.io.errors import MeshFormatError  # brings torch along, which a run has loaded already
+
+    return isinstance(error, (*_MISTAKES, MeshFormatError, FileNotFoundError))
 
 
 def explain(error: Exception, config_dir: Path, config_name: str) -> str:
@@ -188,6 +195,7 @@ def _plain(error: Exception) -> str:
     if isinstance(error, InstantiationException):
         place = re.search(r"full_key: (\S+)", str(error))
         cause = error.__cause__ if error.__cause__ is not None else error
-        return f"{place[1] if place else 'configuration'}: {' '.join(str(cause).split())}"
+        words, key = " ".join(str(cause).split()), place[1] if place else "configuration"
+        return words if words.startswith(f"{key}.") else f"{key}: {words}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if isinstance(error, HydraException) and lines else " ".join(lines) or type(error).__name__

@@ -43,7 +43,7 @@ def test_help_lists_the_groups_without_loading_torch() -> None:
         ("ckpt_path=nowhere", "ckpt_path: there is neither a checkpoint nor a run folder at nowhere"),
         ("ckpt_path=last", "there is no checkpoint under outputs/toy; start without ckpt_path"),
         ("loss.texture.weight=${nothing}", "Interpolation key 'nothing' not found"),
-        ("trainer.max_steps=many", "trainer: "),
+        ("trainer.max_steps=many", "trainer.max_steps must be a number, got 'many'"),
         ("optimizer.lr=much", "optimizer.lr must be a number, got 'much'"),
     ],
 )
@@ -52,6 +52,36 @@ def test_mistakes_are_answered_in_one_line(argument: str, answer: str, train: Tr
     assert code == 2
     assert err.startswith("train.py: ")
     assert answer in err
+    assert err.count("\n") == 1
+
+
+def test_files_that_are_malformed_or_missing_are_mistakes(program: Train, tmp_path: Path) -> None:
+    (tmp_path / "bad.obj").write_text("v 0 0\n")
+    for value, answer in (
+        ("bad.obj", "bad.obj, line 1: "),
+        ("none.obj", "data.path: there is no file"),
+        ("../a.doc", "data.path: there is no file"),
+    ):
+        code, _, err = program("train.py", "task=mesh_fit", f"data.path={tmp_path / value}")
+        assert code == 2
+        assert answer in err
+        assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argument", "answer"),
+    [
+        ("data.name=dog", "there is no mesh 'dog'; there are cow, ico_sphere, torus, cube, or give a path"),
+        ("data.scan_points=many", "data.scan_points must be a number, got 'many'"),
+        ("data.noise=-1", "data.noise must be at least 0"),
+        ("module.samples=0", "module.samples must be at least 1, or null, got 0"),
+        ("surface.levels=[12]", "surface.levels"),
+    ],
+)
+def test_settings_of_a_task_are_mistakes_in_its_words(argument: str, answer: str, program: Train) -> None:
+    code, _, err = program("train.py", "task=mesh_fit", argument)
+    assert code == 2
+    assert err.startswith(f"train.py: {answer}") or (answer in err and "surface" in answer)
     assert err.count("\n") == 1
 
 

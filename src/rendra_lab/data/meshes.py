@@ -14,6 +14,7 @@ from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra.utils.ico_sphere import ico_sphere
 from rendra.utils.torus import torus
+from rendra_lab.errors import UserError
 from rendra_lab.synthesis.cow import CoatParameters, CowParameters, make_cow
 
 Device = torch.device | str
@@ -53,9 +54,9 @@ def load_mesh(
             faces.
     """
     if normalize not in (None, *NORMALIZATIONS):
-        raise ValueError(f"mesh.normalize must be null or one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
+        raise UserError(f"mesh.normalize must be null or one of {', '.join(NORMALIZATIONS)}, got {normalize!r}")
     if not size > 0:
-        raise ValueError(f"mesh.size must be positive, got {size!r}")
+        raise UserError(f"mesh.size must be positive, got {size!r}")
     mesh = _make(name, options, device) if path is None else _read(Path(path), device)
     if mesh.textures is None:
         mesh.textures = TexturesVertex([torch.ones_like(mesh.verts_packed())])
@@ -83,7 +84,7 @@ def _read(path: Path, device: Device) -> Meshes:
         raise FileNotFoundError(f"there is no mesh file {path}{' (it is a folder)' if path.is_dir() else ''}")
     mesh = _read_obj(path, device) if path.suffix.lower() == ".obj" else IO().load_mesh(path, device=device)
     if not len(mesh.faces_packed()):
-        raise ValueError(f"{path} holds no faces, so there is nothing to see")
+        raise UserError(f"{path} holds no faces, so there is nothing to see")
     return mesh
 
 
@@ -106,11 +107,11 @@ def _read_obj(path: Path, device: Device) -> Meshes:
 
 def _make(name: str, options: Mapping[str, Any], device: Device) -> Meshes:
     if name not in _MAKERS:
-        raise ValueError(f"there is no mesh {name!r}; there are {', '.join(_MAKERS)}, or give mesh.path=FILE")
+        raise UserError(f"there is no mesh {name!r}; there are {', '.join(_MAKERS)}, or give a path")
     try:
         return _MAKERS[name](device=device, **options)
     except TypeError as error:
-        raise ValueError(f"mesh {name!r} cannot be made with {dict(options)}: {error}") from error
+        raise UserError(f"mesh {name!r} cannot be made with {dict(options)}: {error}") from error
 
 
 def _cow(

@@ -93,6 +93,10 @@ class TestSpherePyramid:
             SpherePyramid([3, 5])
         with pytest.raises(ValueError, match="one a level"):
             SpherePyramid([3, 4], smoothness=[1.0])
+        with pytest.raises(ValueError, match="one a level"):
+            SpherePyramid([3], smoothness=float("inf"))
+        with pytest.raises(ValueError, match="at most 7, got"):
+            SpherePyramid([8, 9])
         with pytest.raises(ValueError, match="ellipsoid"):
             SpherePyramid([3], start="cube")
 

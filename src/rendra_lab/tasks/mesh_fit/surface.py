@@ -7,6 +7,7 @@ Shapes: V vertices of the level in work, F faces; P points.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from rendra.ops import SubdivideMeshes, self_intersections
 from rendra.structures import Meshes
 from rendra.utils import ico_sphere
 
+_FINEST = 7  # 163,842 vertices
 _REACHES = (2, 3, 4, 6, 8, 12, None)  # edges round crossing faces that are held back; None: all
 _SPREAD = 3**0.5  # half-axis of an ellipsoid over the standard deviation of points on it, along each axis
 
@@ -91,10 +93,12 @@ class SpherePyramid(nn.Module):
         super().__init__()
         if not levels or list(levels) != list(range(levels[0], levels[0] + len(levels))) or levels[0] < 0:
             raise ValueError(f"surface.levels must be consecutive levels of an icosphere, got {list(levels)}")
+        if levels[-1] > _FINEST:
+            raise ValueError(f"surface.levels must be at most {_FINEST}, got {list(levels)}: four times the faces each")
         if start not in ("sphere", "ellipsoid"):
             raise ValueError(f"surface.start must be sphere or ellipsoid, got {start!r}")
         weights = [smoothness] * len(levels) if isinstance(smoothness, (int, float)) else list(smoothness)
-        if len(weights) != len(levels) or min(weights) < 0:
+        if len(weights) != len(levels) or not all(0 <= weight < math.inf for weight in weights):
             raise ValueError(f"surface.smoothness must be one number of at least 0 or one a level, got {smoothness}")
         self.start = start
         self.stays_simple = stays_simple

@@ -57,6 +57,8 @@ class MeshFit(Task[CloudBatch, SurfacePrediction]):
         if len(refine_at) != len(surface.offsets) - 1 or sorted(refine_at) != list(refine_at):
             levels = len(surface.offsets)
             raise ValueError(f"module.refine_at: {levels} levels begin at {levels - 1} rising steps, got {refine_at}")
+        if samples is not None and samples < 1:
+            raise ValueError(f"module.samples must be at least 1, or null, got {samples}")
         self.surface = surface
         self.samples = samples
         if check_every < 1:
