@@ -62,7 +62,10 @@ def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             )
         with _Process.lock:
             _Process.has_run = True
+            threads = torch.get_num_threads()
             numba.set_num_threads(num_threads())
+            if torch.get_num_threads() != threads:  # Numba, when it starts its threads, tells OpenMP to use them all
+                torch.set_num_threads(threads)
             known = len(compiled.overloads)
             started = time.perf_counter()
             result = compiled(*arguments)

@@ -15,7 +15,9 @@ def draw(_=0):
 
 if __name__ == "__main__":
     mode = sys.argv[1]
+    torch.set_num_threads(1)
     value = draw()
+    assert torch.get_num_threads() == 1  # although Numba has started a thread for every core
     if mode == "threads":
         threads = [threading.Thread(target=lambda: [draw() for _ in range(50)]) for _ in range(4)]
         [t.start() for t in threads]
