@@ -1,10 +1,13 @@
 """A tree of bounding boxes, eight children a node, over points or triangles of a packed batch.
 
-Items are sorted along a Morton curve; eight neighbours make a leaf, eight leaves a node, and so on, segment by
-segment (one for each cloud or mesh). A *group* is eight boxes side by side, so that one pass of vector code bounds
-them all. Items are (I, k, 3) arrays: k = 1 for points, k = 3 for triangles. What is not finite is in no box.
+Items are halved at the median of their longest side until eight are left; these make a leaf, eight leaves a node,
+and so on, segment by segment (one for each cloud or mesh). A *group* is eight boxes side by side, so that one pass of
+vector code bounds them all. Items are (I, k, 3) arrays: k = 1 for points, k = 3 for triangles. What is not finite is
+in no box. Those who ask come along a Morton curve, so that neighbours follow each other: sorting them so is faster
+than halving, but makes boxes that overlap.
 
-Morton, "A computer oriented geodetic data base", IBM 1966; Wald, Benthin and Boulos, "Getting rid of packets", 2008.
+Bentley, "Multidimensional binary search trees", 1975; Morton, "A computer oriented geodetic data base", IBM 1966;
+Wald, Benthin and Boulos, "Getting rid of packets", 2008.
 """
 
 import math
@@ -17,10 +20,12 @@ GROUP = 8
 STACK = 8 * 12  # entries that a walk may need: seven siblings left over on each of at most twelve levels
 
 _ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
 _INFINITY = np.float32(np.inf)
 _AXIS_BITS = 18
 _CELLS = np.float32(2**_AXIS_BITS - 1)
 _DIGIT_BITS = 11
+_HALVINGS = 64  # parts that wait to be split: at most one more than splits on the way to a leaf
 _PASSES = 5  # 55 bits hold three times 18
 
 
@@ -92,6 +97,93 @@ def spatial_order(items, first):
                 spare[histogram[digit]] = order[k]
                 histogram[digit] += 1
             order[first[n] : first[n + 1]] = spare[first[n] : first[n + 1]]
+    return order
+
+
+@scalar_kernel
+def _centres(items, begin, end, order, centres):
+    """Write the centres (I, 3) of a segment, and the items into `order`: returns where those not finite begin."""
+    share = np.float32(1.0) / np.float32(items.shape[1])  # before the sum: that may overflow
+    finite, last = begin, end
+    for i in range(begin, end):
+        if not is_finite(items[i]):
+            last -= 1
+            order[last] = i
+            continue
+        order[finite] = i
+        finite += 1
+        for axis in range(3):
+            total = _ZERO
+            for c in range(items.shape[1]):
+                total += items[i, c, axis] * share
+            centres[i, axis] = total
+    return finite
+
+
+@scalar_kernel
+def _widest_axis(centres, order, begin, end):
+    axis, widest = 0, -_ONE
+    for candidate in range(3):
+        low, high = _INFINITY, -_INFINITY
+        for k in range(begin, end):
+            low = min(low, centres[order[k], candidate])
+            high = max(high, centres[order[k], candidate])
+        if high - low > widest:
+            axis, widest = candidate, high - low
+    return axis
+
+
+@scalar_kernel
+def _part(keys, order, begin, end, middle):
+    """Move the smaller keys of [begin, end) before `middle`, and `order` along (Hoare, "Find", 1961)."""
+    low, high, chance = begin, end - 1, 1
+    while low < high:
+        chance = (chance * 1103515245 + 12345) & 0x7FFFFFFF  # no order of the items can make this quadratic
+        pivot = keys[low + (chance >> 8) % (high - low + 1)]
+        i, j = low, high
+        while i <= j:
+            while keys[i] < pivot:
+                i += 1
+            while keys[j] > pivot:
+                j -= 1
+            if i <= j:
+                keys[i], keys[j] = keys[j], keys[i]
+                order[i], order[j] = order[j], order[i]
+                i, j = i + 1, j - 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@scalar_kernel
+def tree_order(items, first):
+    """Indices (I,) of the items, each segment [first[n], first[n + 1]) in the order of the tree's leaves."""
+    order, keys = np.empty(len(items), np.int64), np.empty(len(items), np.float32)
+    centres = np.empty((len(items), 3), np.float32)
+    begins, ends = np.empty(_HALVINGS, np.int64), np.empty(_HALVINGS, np.int64)
+    for n in range(len(first) - 1):
+        begins[0], ends[0] = first[n], _centres(items, first[n], first[n + 1], order, centres)
+        waiting = 1
+        while waiting:
+            waiting -= 1
+            begin, end = begins[waiting], ends[waiting]
+            size = end - begin
+            if size <= GROUP:
+                continue
+            whole = GROUP  # items below a full box of the level that is split
+            while whole * GROUP < size:
+                whole *= GROUP
+            middle = begin + ((size + whole - 1) // whole + 1) // 2 * whole
+            axis = _widest_axis(centres, order, begin, end)
+            for k in range(begin, end):
+                keys[k] = centres[order[k], axis]
+            _part(keys, order, begin, end, middle)
+            begins[waiting], ends[waiting] = begin, middle
+            begins[waiting + 1], ends[waiting + 1] = middle, end
+            waiting += 2
     return order
 
 

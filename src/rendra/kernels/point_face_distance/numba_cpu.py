@@ -10,7 +10,16 @@ import math
 import numpy as np
 from numba import prange
 
-from rendra.kernels.box_tree import GROUP, STACK, build_tree, diagonal, is_finite, push_children, spatial_order
+from rendra.kernels.box_tree import (
+    GROUP,
+    STACK,
+    build_tree,
+    diagonal,
+    is_finite,
+    push_children,
+    spatial_order,
+    tree_order,
+)
 from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 from rendra.kernels.point_face_distance.lanes import face_to_eight_points, point_to_eight_faces
 
@@ -46,7 +55,7 @@ def _nearest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     query_ends, target_ends = np.append(queries_first, len(queries)), np.append(targets_first, len(targets))
     order = spatial_order(queries, query_ends)
-    tree = build_tree(targets, spatial_order(targets, target_ends), target_ends)
+    tree = build_tree(targets, tree_order(targets, target_ends), target_ends)
     owner = np.repeat(np.arange(len(queries_first)), np.diff(query_ends))
     squared, index = np.empty(len(queries), np.float32), np.empty(len(queries), np.int64)
     weights = np.empty((len(queries), 3), np.float32)
