@@ -94,7 +94,9 @@ class SpherePyramid(nn.Module):
         if not levels or list(levels) != list(range(levels[0], levels[0] + len(levels))) or levels[0] < 0:
             raise ValueError(f"surface.levels must be consecutive levels of an icosphere, got {list(levels)}")
         if levels[-1] > _FINEST:
-            raise ValueError(f"surface.levels must be at most {_FINEST}, got {list(levels)}: four times the faces each")
+            raise ValueError(
+                f"surface.levels must be at most {_FINEST}, got {list(levels)}: four times the faces each"
+            )
         if start not in ("sphere", "ellipsoid"):
             raise ValueError(f"surface.start must be sphere or ellipsoid, got {start!r}")
         weights = [smoothness] * len(levels) if isinstance(smoothness, (int, float)) else list(smoothness)
