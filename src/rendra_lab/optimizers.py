@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -164,6 +165,8 @@ class UniformAdam(torch.optim.Optimizer):
 
     def __init__(self, params: Any, lr: float = 0.1, betas: Sequence[float] = (0.9, 0.999)) -> None:
         first, second = betas
+        if not 0 <= lr < math.inf:
+            raise ValueError(f"lr must be a number of at least 0, got {lr}")
         if not (0 <= first < 1 and 0 <= second < 1):
             raise ValueError(f"betas must lie in [0, 1), got {list(betas)}")
         super().__init__(params, {"lr": lr, "betas": (float(first), float(second))})

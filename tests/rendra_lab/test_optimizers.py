@@ -112,3 +112,5 @@ def test_uniform_adam_leaves_alone_what_has_no_gradient_and_survives_a_zero_one(
 def test_uniform_adam_refuses_betas_outside_their_range():
     with pytest.raises(ValueError, match="betas"):
         UniformAdam([nn.Parameter(torch.zeros(1))], betas=(0.9, 1.0))
+    with pytest.raises(ValueError, match="lr must be a number of at least 0, got -1"):
+        UniformAdam([nn.Parameter(torch.zeros(1))], lr=-1.0)

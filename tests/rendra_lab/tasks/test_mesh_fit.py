@@ -19,7 +19,7 @@ from rendra_lab.experiment import run
 from rendra_lab.mesh_quality import signed_volume
 from rendra_lab.tasks.mesh_fit.data import CloudBatch, ScannedCloud
 from rendra_lab.tasks.mesh_fit.surface import Diffusion, SpherePyramid
-from rendra_lab.tasks.mesh_fit.views import balls, upright
+from rendra_lab.tasks.mesh_fit.views import CloudViews, balls, upright
 
 
 def laplacian(mesh: Meshes) -> Tensor:
@@ -138,9 +138,22 @@ class TestScannedCloud:
         IO().save_pointcloud(Pointclouds([torch.ones(9, 3)]), tmp_path / "one.ply")
         with pytest.raises(UserError, match="in one place"):
             ScannedCloud(tmp_path / "one.ply").setup("fit")
+        IO().save_pointcloud(Pointclouds([1e30 * torch.randn(9, 3)]), tmp_path / "far.ply")
+        with pytest.raises(UserError, match=r"far.ply: a coordinate of .*e\+30, expected at most 1e\+15"):
+            ScannedCloud(tmp_path / "far.ply").setup("fit")
+
+    @pytest.mark.parametrize("given", [{"noise": float("nan")}, {"scan_points": 2_000_000_000}, {"most": 0}])
+    def test_refuses_what_cannot_be_scanned(self, given: dict[str, Any]) -> None:
+        with pytest.raises(UserError, match=f"data.{next(iter(given))} must lie between"):
+            ScannedCloud(**given)
 
 
 class TestViews:
+    @pytest.mark.parametrize("size", [(10,), (0, 0), (9, 10_000)])
+    def test_refuses_sizes_that_are_no_picture(self, size: tuple[int, ...]) -> None:
+        with pytest.raises(ValueError, match="views.size must be height and width from 1 to 8192"):
+            CloudViews(size=size)
+
     def test_something_long_stands_on_its_wider_end(self) -> None:
         height = torch.rand(500, 1)
         cone = torch.cat([height, 0.08 * (1 - height) * torch.randn(500, 2)], 1)  # its tip at +x

@@ -12,6 +12,7 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from rendra.io import IO
+from rendra.io.errors import MeshFormatError
 from rendra.ops import knn_points, sample_points_from_meshes
 from rendra.structures import Meshes, Pointclouds
 from rendra_lab.data.meshes import load_mesh
@@ -22,6 +23,7 @@ from rendra_lab.records import TensorRecord
 log = logging.getLogger(__name__)
 
 _FEWEST = 4  # points that span a volume
+_FARTHEST = 1e15  # of a coordinate: single precision squares it, and adds the squares of all points
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,13 @@ class ScannedCloud(LightningDataModule):
         steps: int = 100_000,
     ) -> None:
         super().__init__()
-        for key, value, least in (
-            ("scan_points", scan_points, _FEWEST),
-            ("most", most, _FEWEST),
-            ("noise", noise, 0),
+        for key, value, least, largest in (
+            ("scan_points", scan_points, _FEWEST, 10_000_000),
+            ("most", most, _FEWEST, 10_000_000),
+            ("noise", noise, 0, 1_000_000),
         ):
-            if value < least:
-                raise UserError(f"data.{key} must be at least {least}, got {value}")
+            if not least <= value <= largest:
+                raise UserError(f"data.{key} must lie between {least} and {largest:.0e}, got {value}")
         self.path = None if path is None else Path(path)
         self.mesh_name = name
         self.scan_points = scan_points
@@ -119,7 +121,12 @@ class ScannedCloud(LightningDataModule):
     def _read(self, path: Path, generator: torch.Generator) -> Tensor:
         if not path.is_file():
             raise UserError(f"data.path: there is no file {path}")
-        geometry = IO().load_geometry(path, include_textures=False)
+        try:
+            geometry = IO().load_geometry(path, include_textures=False)
+        except MeshFormatError:
+            raise
+        except ValueError as error:  # no format has its suffix
+            raise UserError(f"data.path: {error}") from error
         return geometry.points_packed() if isinstance(geometry, Pointclouds) else self._scan(geometry, generator)
 
     def _scan(self, mesh: Meshes, generator: torch.Generator) -> Tensor:
@@ -132,5 +139,8 @@ class ScannedCloud(LightningDataModule):
 def _check(scan: Tensor, origin: object) -> None:
     if not bool(scan.isfinite().all()):
         raise UserError(f"{origin}: point {int((~scan.isfinite()).any(1).nonzero()[0])} is not finite")
+    if bool((scan.abs() > _FARTHEST).any()):
+        farthest = float(scan.abs().amax())
+        raise UserError(f"{origin}: a coordinate of {farthest:.1e}, expected at most {_FARTHEST:.0e}; scale the file")
     if len(scan) < _FEWEST or float((scan - scan.mean(0)).abs().amax()) == 0:
         raise UserError(f"{origin} holds {len(scan)} points, or all in one place: there is no surface to fit")

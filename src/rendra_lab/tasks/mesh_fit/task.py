@@ -48,12 +48,13 @@ class MeshFit(Task[CloudBatch, SurfacePrediction]):
         self,
         surface: SpherePyramid,
         samples: int | None = None,
-        refine_at: Sequence[int] = (),
+        refine_at: Sequence[int] | int = (),
         check_every: int = 4,
         views: CloudViews | None = None,
         **parts: Any,
     ) -> None:
         super().__init__(**parts)
+        refine_at = [refine_at] if isinstance(refine_at, int) else refine_at
         if len(refine_at) != len(surface.offsets) - 1 or sorted(refine_at) != list(refine_at):
             levels = len(surface.offsets)
             raise ValueError(f"module.refine_at: {levels} levels begin at {levels - 1} rising steps, got {refine_at}")

@@ -13,6 +13,7 @@ from rendra.transforms import axis_angle_to_matrix
 from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
 
 _CLOUD, _SURFACE = (0.16, 0.42, 0.80), (0.86, 0.80, 0.70)
+_LARGEST = 8192  # pixels along a side
 _STANDING = 2.0  # how much longer than the others the axis of something upright is
 _SHOWN = 3000  # points at most
 
@@ -30,6 +31,8 @@ class CloudViews:
         if up is not None and (len(up) != 3 or not any(up)):
             raise ValueError(f"views.up must be a direction such as [0,0,1], or null, got {up}")
         self.up = None if up is None else [float(x) for x in up]
+        if len(size) != 2 or not all(1 <= side <= _LARGEST for side in size):
+            raise ValueError(f"views.size must be height and width from 1 to {_LARGEST} pixels, got {list(size)}")
         self.size = (size[0], size[1])
         self._points: Tensor | None = None  # whose pictures and frame are kept
         self._pictures: dict[str, Tensor] = {}
