@@ -18,7 +18,7 @@ from rendra.vis import texturesuv_islands_image
 from rendra_lab.data.meshes import bounding_sphere, load_mesh
 from rendra_lab.mesh_asset import Asset, Material
 from rendra_lab.mesh_report import Findings, nearest_distances
-from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
+from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio, point_marks
 from rendra_lab.visualization import Picture, caption, tile, to_picture
 
 _SIDES = {
@@ -107,15 +107,11 @@ def cloud_as_mesh(cloud: Pointclouds, most: int = _MOST_POINTS) -> Meshes:
     if len(chosen) > most:
         chosen = chosen[torch.arange(most, device=points.device) * len(chosen) // most]
     points = points[chosen].float()
-    axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(points)
-    sides = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
-    verts = (points[:, None] + _radius(points) * axes).flatten(0, 1)
-    faces = (6 * torch.arange(len(points))[:, None, None] + sides).flatten(0, 1).to(points.device)
     if features is not None and features.shape[1] in (3, 4):
         colors = features[chosen, :3].float().clamp(0, 1)
     else:
         colors = _by_height(points)
-    return Meshes([verts], [faces], TexturesVertex([colors.repeat_interleave(6, dim=0)]))
+    return point_marks(points, _radius(points), colors)
 
 
 def _radius(points: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Pictures of one mesh for people: a camera on an orbit, lights, antialiasing, galleries and turntables.
+"""Pictures of one mesh, or of points, for people: orbiting cameras, lights, antialiasing, galleries, turntables.
 
 Images are (H, W, 4) RGBA in [0, 1], alpha not premultiplied.
 """
@@ -21,6 +21,7 @@ from rendra.renderer.lighting import DirectionalLights, PointLights
 from rendra.renderer.materials import Materials
 from rendra.renderer.mesh.rasterizer import MeshRasterizer, RasterizationSettings
 from rendra.renderer.mesh.renderer import MeshRenderer
+from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra_lab.data.meshes import bounding_sphere
 from rendra_lab.errors import UserError
@@ -36,6 +37,16 @@ FILE_NAMES = {
     "mp4": "turntable.mp4",
 }
 _SHOWS = ("color", "alpha", "depth")
+_OCTAHEDRON = (
+    (0, 1, 2),
+    (1, 3, 2),
+    (3, 4, 2),
+    (4, 0, 2),
+    (1, 0, 5),
+    (3, 1, 5),
+    (4, 3, 5),
+    (0, 4, 5),
+)  # +x +y +z -x ...
 _EDGE_ALPHA = 1e-4  # a soft edge ends where its sigmoid has fallen to this
 
 
@@ -205,6 +216,22 @@ class Studio:
         near, far = (depth[seen].aminmax()) if seen.any() else (depth.new_zeros(()), depth.new_ones(()))
         light = 1 - 0.8 * (depth - near) / (far - near).clamp_min(1e-9)
         return torch.cat([(light * seen).expand(-1, -1, 3), torch.ones_like(depth)], dim=-1)
+
+
+def point_marks(points: Tensor, radius: float | Tensor, colors: Tensor | Sequence[float]) -> Meshes:
+    """Points as one mesh of octahedra, so that they are drawn like any surface.
+
+    Args:
+        points: (P, 3).
+        radius: from a point to the corners of its octahedron.
+        colors: RGB in [0, 1], (P, 3), or (3,) for all.
+    """
+    count, device = len(points), points.device
+    corners = torch.cat([torch.eye(3), -torch.eye(3)]).to(points) * radius
+    sides = torch.tensor(_OCTAHEDRON, device=device) + 6 * torch.arange(count, device=device)[:, None, None]
+    painted = torch.as_tensor(colors).to(points).expand(count, 3).repeat_interleave(6, dim=0)
+    verts = (points[:, None] + corners).flatten(0, 1)
+    return Meshes([verts], [sides.flatten(0, 1)], TexturesVertex([painted]))
 
 
 def cut_out(image: Tensor, background: Sequence[float]) -> Tensor:

@@ -29,6 +29,7 @@ from rendra_lab.pictures import (
     gallery,
     kind_of_picture,
     parse_color,
+    point_marks,
     save_image,
     turntable,
 )
@@ -42,6 +43,20 @@ def cow() -> Meshes:
 @pytest.fixture
 def studio() -> Studio:
     return Studio(OrbitCamera(), Headlight(), Materials(), Shading(HardPhongShader()), size=(48, 48), antialias=1)
+
+
+def test_marks_stand_round_their_points_in_their_colours() -> None:
+    points, colors = torch.randn(5, 3), torch.rand(5, 3)
+    marks = point_marks(points, 0.1, colors)
+    corners = marks.verts_packed().view(5, 6, 3)
+    assert_close(corners.mean(1), points, atol=1e-6)
+    assert_close((corners - points[:, None]).norm(dim=2), torch.full((5, 6), 0.1), atol=1e-6)
+    assert_close(marks.textures.verts_features_packed().view(5, 6, 3), colors[:, None].expand(5, 6, 3))
+    outwards = marks.faces_normals_packed().view(5, 8, 3) * (
+        marks.verts_packed()[marks.faces_packed()].mean(1).view(5, 8, 3) - points[:, None]
+    )
+    assert (outwards.sum(2) > 0).all()
+    assert point_marks(torch.zeros(0, 3), 0.1, (1.0, 0.0, 0.0)).isempty()
 
 
 @pytest.mark.parametrize("orthographic", [False, True])

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from rendra.renderer import HardFlatShader, Materials, TexturesVertex
 from rendra.structures import Meshes, join_meshes_as_scene
-from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
-from rendra_lab.tasks.localize.solids import octahedron
+from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio, point_marks
 
 _SEEN, _ESTIMATE = (0.16, 0.42, 0.80), (0.93, 0.62, 0.25)
 _SHOWN = 700  # points of a mesh
+_MARK = 0.01  # size of a point, in radii of the scene
 _FOV_DEG = 40.0
 _SIZE = (300, 300)
 
@@ -28,7 +28,7 @@ def picture(points: Tensor, seen: Meshes, known: Meshes, estimate: Tensor) -> Te
     corners = torch.cat([seen.verts_packed(), known.verts_packed()])
     low, high = corners.amin(0), corners.amax(0)
     radius = float((high - low).norm()) / 2
-    scene = [_painted(moved, _ESTIMATE), _painted(_dots(points, 0.01 * radius), _SEEN)]
+    scene = [_painted(moved, _ESTIMATE), point_marks(points, _MARK * radius, _SEEN)]
     camera = OrbitCamera(
         dist=max(radius, 1e-6) / math.sin(math.radians(_FOV_DEG / 2)),
         elev=15.0,
@@ -44,15 +44,6 @@ def picture(points: Tensor, seen: Meshes, known: Meshes, estimate: Tensor) -> Te
 def _azimuth_deg(way: Tensor) -> float:
     """Where a camera looks across a way (3,), so that its length is seen."""
     return math.degrees(math.atan2(-float(way[2]), float(way[0]))) if float(way[[0, 2]].norm()) > 0 else 0.0
-
-
-def _dots(points: Tensor, radius: float) -> Meshes:
-    """Points (P, 3) as one mesh of small octahedra."""
-    dot = octahedron().to(points.device)
-    verts = points[:, None] + radius / 3**0.5 * dot.verts_packed()
-    first = len(dot.verts_packed()) * torch.arange(len(points), device=points.device)
-    faces = dot.faces_packed() + first[:, None, None]
-    return Meshes([verts.reshape(-1, 3)], [faces.reshape(-1, 3)])
 
 
 def _painted(mesh: Meshes, colour: tuple[float, float, float]) -> Meshes:

@@ -10,7 +10,7 @@ from torch import Tensor
 from rendra.renderer import HardFlatShader, Materials, TexturesVertex
 from rendra.structures import Meshes
 from rendra.transforms import axis_angle_to_matrix
-from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
+from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio, point_marks
 
 _CLOUD, _SURFACE = (0.16, 0.42, 0.80), (0.86, 0.80, 0.70)
 _LARGEST = 8192  # pixels along a side
@@ -75,14 +75,7 @@ def upright(points: Tensor, up: Sequence[float] | None = None) -> Tensor:
 def balls(points: Tensor) -> Meshes:
     """Points (P, 3) as octahedra that do not touch in a cloud of about even density."""
     radius = 0.35 * (points.amax(0) - points.amin(0)).amax() / max(len(points), 1) ** 0.5
-    corners = torch.cat([torch.eye(3), -torch.eye(3)]).to(points) * radius.clamp_max(0.02)
-    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
-    numbers = (
-        torch.tensor(faces, device=points.device) + 6 * torch.arange(len(points)).to(points.device)[:, None, None]
-    )
-    verts = (points[:, None] + corners).reshape(-1, 3)
-    colours = torch.tensor(_CLOUD).to(points).expand_as(verts)
-    return Meshes([verts], [numbers.reshape(-1, 3)], TexturesVertex([colours]))
+    return point_marks(points, radius.clamp_max(0.02), _CLOUD)
 
 
 def _guess_up(points: Tensor) -> Tensor:
