@@ -162,14 +162,11 @@ def plot_scene(
     )
     viewpoints = _viewpoints(viewpoint_cameras, len(plots))
     for number, traces in enumerate(plots.values()):
-        row, column = divmod(number, ncols)
-        extents = []
-        for name, struct in traces.items():
-            trace, points = _trace(go, name, struct, style)
-            figure.add_trace(trace, row=row + 1, col=column + 1)
-            extents.append(points)
-        scene = _scene(extents, viewpoints[number], kwargs)
-        figure.update_scenes(scene, row=row + 1, col=column + 1)
+        place = {"row": number // ncols + 1, "col": number % ncols + 1}
+        drawn = [_trace(go, name, struct, style) for name, struct in traces.items()]
+        for trace, _ in drawn:
+            figure.add_trace(trace, **place)
+        figure.update_scenes(_scene([points for _, points in drawn], viewpoints[number], kwargs), **place)
     figure.update_layout(height=_ROW_PX * rows, margin={"l": 0, "r": 0, "t": 40, "b": 0})
     return figure
 
