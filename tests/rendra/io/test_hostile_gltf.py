@@ -384,9 +384,34 @@ junk = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(st.lists(st.tuples(st.sampled_from(PLACES), junk), min_size=1, max_size=2), st.booleans())
-def test_fuzzed_documents(changes, cut):
+def test_fuzzed_documents():
+    fuzz_documents(60)
+
+
+@pytest.mark.slow
+def test_many_fuzzed_documents():
+    fuzz_documents(10_000)
+
+
+def fuzz_documents(examples: int) -> None:
+    @settings(
+        max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None
+    )
+    @given(st.lists(st.tuples(st.sampled_from(PLACES), junk), min_size=1, max_size=2), st.booleans())
+    def judge(changes, cut):
+        try:
+            parts = parse(_changed(changes)[: -40 if cut else None])
+        except MeshFormatError:
+            return
+        assert all(
+            not part.faces.size or 0 <= part.faces.min() <= part.faces.max() < len(part.verts) for part in parts
+        )
+
+    judge()
+
+
+def _changed(changes: list[tuple[tuple, Any]]) -> bytes:
+    """The rich file with other values in some places."""
     document = json.loads(json.dumps(RICH.finished()))
     for (*way, last), value in changes:
         at: Any = document
@@ -396,9 +421,4 @@ def test_fuzzed_documents(changes, cut):
             at[last] = copy.deepcopy(value)
         except (KeyError, IndexError, TypeError):
             continue  # an earlier change took this place away
-    data = container(json.dumps(document).encode(), RICH.binary)
-    try:
-        parts = parse(data[: len(data) - 40] if cut else data)
-    except MeshFormatError:
-        return
-    assert all(part.faces.size == 0 or 0 <= part.faces.min() <= part.faces.max() < len(part.verts) for part in parts)
+    return container(json.dumps(document).encode(), RICH.binary)

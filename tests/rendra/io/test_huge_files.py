@@ -99,7 +99,7 @@ OBJ_TEXTS = {
 MTL_TEXTS = {
     "a number that is none": ("newmtl a\nNs " + "9" * 2 * M + "x\n", "bad material value"),
     "a number of ten megabytes": ("newmtl a\nNs 0." + "9" * 10 * M + "\n", None),
-    "options without end": ("newmtl a\nmap_Kd " + "-bm 1 " * (M // 10) + "lost.png\n", None),
+    "options without end": ("newmtl a\nmap_Kd " + "-bm 1 " * (M // 30) + "lost.png\n", None),
     "a name of ten megabytes": ("newmtl a\nmap_Kd " + "x" * 10 * M + "\n", None),
     "materials without end": ("".join(f"newmtl {i}\nKd 1\n" for i in range(M // 50)), None),
 }
