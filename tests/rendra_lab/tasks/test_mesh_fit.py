@@ -151,7 +151,7 @@ class TestScannedCloud:
 class TestViews:
     @pytest.mark.parametrize("size", [(10,), (0, 0), (9, 10_000)])
     def test_refuses_sizes_that_are_no_picture(self, size: tuple[int, ...]) -> None:
-        with pytest.raises(ValueError, match="views.size must be height and width from 1 to 8192"):
+        with pytest.raises(ValueError, match=r"views\.size must be height and width from 1 to 8192"):
             CloudViews(size=size)
 
     def test_something_long_stands_on_its_wider_end(self) -> None:
