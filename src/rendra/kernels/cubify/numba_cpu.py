@@ -29,7 +29,7 @@ def forward(
     occupied = np.zeros((n, words, height + 2, width + 2), np.int64)
     used = np.empty((n, height + 1, width + 1, words), np.int64)
     counts = np.empty((2, used.size), np.int64)
-    _pack(voxels, np.float32(thresh), workers, occupied)
+    _pack(voxels.reshape(n, depth, height * width), np.float32(thresh), workers, occupied)
     _survey(occupied, workers, used, counts[0], counts[1])
     ends = np.cumsum(counts, axis=1)
     num_verts, num_quads = counts.reshape(2, n, (height + 1) * (width + 1) * words).sum(axis=2)
@@ -44,20 +44,28 @@ def forward(
 
 @parallel_kernel
 def _pack(voxels, thresh, workers, occupied):
-    n, depth, height, _ = voxels.shape
+    """Compare voxels (N, D, H W) and write their bits."""
+    n, depth, _ = voxels.shape
+    words, height, width = occupied.shape[1], occupied.shape[2] - 2, occupied.shape[3] - 2
     blocks = (height + _ROWS_AT_ONCE - 1) // _ROWS_AT_ONCE
     for worker in prange(workers):
-        for task in range(worker, n * blocks, workers):
-            grid, row = task // blocks, task % blocks * _ROWS_AT_ONCE
-            for k in range(depth):
-                for j in range(row, min(row + _ROWS_AT_ONCE, height)):
-                    _pack_row(voxels[grid, k, j], thresh, k % _BITS, occupied[grid, k // _BITS, j + 1])
+        packed = np.empty(_ROWS_AT_ONCE * width, np.int64)
+        for task in range(worker, n * blocks * words, workers):
+            grid, row, m = task // words // blocks, task // words % blocks * _ROWS_AT_ONCE, task % words
+            end = min(row + _ROWS_AT_ONCE, height)
+            packed[:] = 0
+            for k in range(m * _BITS, min((m + 1) * _BITS, depth)):
+                _pack_layer(voxels[grid, k, row * width : end * width], thresh, k % _BITS, packed)
+            for j in range(row, end):
+                for i in range(width):
+                    occupied[grid, m, j + 1, i + 1] = packed[(j - row) * width + i]
 
 
 @scalar_kernel
-def _pack_row(values, thresh, bit, columns):
+def _pack_layer(values, thresh, bit, packed):
+    """One long loop: the columns of several rows, side by side."""
     for i in range(len(values)):
-        columns[i + 1] |= np.int64(values[i] >= thresh) << bit
+        packed[i] |= np.int64(values[i] >= thresh) << bit
 
 
 @scalar_kernel
