@@ -30,25 +30,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     from rendra_lab.mesh_asset import read_asset
     from rendra_lab.mesh_report import as_json, as_text, report_on
-    from rendra_lab.mesh_sheet import draw_sheet
+    from rendra_lab.mesh_sheet import NothingToSee, draw_sheet
     from rendra_lab.visualization import save_picture
 
-    written = []
+    remarks = []
     try:
         asset = read_asset(options.file)
         report, findings = report_on(asset)
         if options.json:
             options.json.parent.mkdir(parents=True, exist_ok=True)
             options.json.write_text(as_json(report))
-            written.append(options.json)
+            remarks.append(f"wrote {options.json}")
         if not options.no_picture:
             output = options.output or Path(f"{options.file.stem}_inspected.png")
-            written.append(save_picture(output, draw_sheet(asset, findings, options.size)))
+            remarks.append(f"wrote {save_picture(output, draw_sheet(asset, findings, options.size))}")
+    except NothingToSee as error:
+        remarks.append(f"no picture: {error}")
     except (ValueError, OSError) as error:
         sys.stderr.write(f"inspect.py: {' '.join(str(error).split())}\n")
         sys.exit(2)
     text, _, verdict = as_text(report).rpartition("\n")
-    print(text, *(f"  wrote {path}" for path in written), verdict, sep="\n")
+    print(text, *(f"  {remark}" for remark in remarks), verdict, sep="\n")
 
 
 def _parser() -> argparse.ArgumentParser:

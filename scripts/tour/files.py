@@ -37,6 +37,9 @@ Ns 20
 """
 
 
+SAME_OBJ = "written as OBJ and read again: same=True"
+
+
 def main(file: str | None = None) -> None:
     """Reads the user's OBJ file, or a house of one square wall and a triangular roof."""
     with tempfile.TemporaryDirectory() as folder:
@@ -59,7 +62,8 @@ def main(file: str | None = None) -> None:
         print("texture images:", list(properties.texture_images or {}) or "none")
         save_obj(Path(folder) / "copy.obj", verts, faces.verts_idx)
         again, _, _ = load_obj(Path(folder) / "copy.obj")
-        print(f"written as OBJ and read again: same={torch.equal(again, verts)}")
+        moved = float((again - verts).abs().max()) if len(verts) else 0.0  # text has so many digits
+        print(f"written as OBJ and read again: moved by at most {moved:.0e}" if moved else SAME_OBJ)
         save_ply(Path(folder) / "copy.ply", verts, faces.verts_idx)  # binary; ascii=True for text
         again, faces_again = load_ply(Path(folder) / "copy.ply")
         print(f"written as PLY and read again: same={torch.equal(again, verts)}, {len(faces_again)} triangles")
@@ -76,4 +80,7 @@ def rounded(values: torch.Tensor) -> list:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    try:
+        main(*sys.argv[1:2])
+    except (OSError, ValueError) as error:  # ValueError: MeshFormatError, with file and line
+        sys.exit(f"files.py: {error}")

@@ -60,7 +60,7 @@ def read_asset(path: str | Path) -> Asset:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: no format has its suffix, or it is malformed (MeshFormatError).
+        ValueError: no format has its suffix, it holds nothing, or it is malformed (MeshFormatError).
     """
     path = Path(path)
     if not path.is_file():
@@ -68,6 +68,8 @@ def read_asset(path: str | Path) -> Asset:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         asset = _read_obj(path) if path.suffix.lower() == ".obj" else _read_other(path)
+    if asset.mesh is None and not (asset.cloud is not None and len(asset.cloud.points_packed())):
+        raise ValueError(f"{path} holds neither faces nor points")
     notes = tuple(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))
     return Asset(**{**vars(asset), "notes": notes})
 

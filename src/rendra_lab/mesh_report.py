@@ -444,13 +444,15 @@ def as_text(report: MeshReport | CloudReport) -> str:
 
 def _mesh_rows(report: MeshReport) -> Iterator[tuple[str, str]]:
     topology, merged = report.topology, report.merged
-    yield "size", f"{report.verts:,} vertices, {report.faces:,} faces, {topology.edges:,} edges"
+    sizes = ((report.verts, "vertex"), (report.faces, "face"), (topology.edges, "edge"))
+    yield "size", ", ".join(_count(count, name) for count, name in sizes)
     yield from _bounds_rows(report.bounds)
-    volume = "none: not closed" if report.volume is None else f"{report.volume:.6g}"
+    volume = "none: not a closed manifold" if report.volume is None else f"{report.volume:.6g}"
     yield "area, volume", f"{report.area:.6g}, {volume}"
     lengths = (report.edge_length_min, report.edge_length_mean, report.edge_length_max)
     yield "edge lengths", f"{_spaced(lengths, ' .. ')} (min, mean, max), spread {report.edge_length_spread:.3f}"
-    yield "bend at edges", f"{report.mean_dihedral_deg:.3g} degrees on average"
+    bend, alone = f"{report.mean_dihedral_deg:.3g} degrees on average", "none: no two faces share an edge"
+    yield "bend at edges", alone if math.isnan(report.mean_dihedral_deg) else bend
     yield "colours", report.colors
     for material in report.materials:
         yield "material", _material_text(material)

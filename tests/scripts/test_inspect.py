@@ -43,6 +43,27 @@ def test_no_picture_and_a_chosen_place(tmp_path: Path, monkeypatch: pytest.Monke
     assert Path("pictures/b.png").is_file()
 
 
+def test_what_has_no_extent_has_numbers_and_no_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("flat.obj").write_text("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n")
+    inspect("flat.obj", "--size", "32")
+    lines = capsys.readouterr().out.splitlines()
+    assert "  no picture: flat.obj has no extent, so there is nothing to draw" in lines
+    assert "1 degenerate face" in lines[-1]
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("name", ["empty.obj", "empty.xyz"])
+def test_an_empty_file_is_a_mistake(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / name).write_text("")
+    with pytest.raises(SystemExit) as stop:
+        inspect(tmp_path / name)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.endswith(f"{name} holds neither faces nor points\n")
+
+
 @pytest.mark.parametrize(("name", "content"), [("no.obj", None), ("a.doc", "x"), ("a.ply", "ply\nformat what\n")])
 def test_a_file_that_cannot_be_read_is_one_line_and_exit_2(
     name: str,
