@@ -16,7 +16,8 @@ import torch.nn as nn
 from assertions import assert_close, assert_finite
 
 from rendra.io import IO, load_obj, load_objs_as_meshes, load_ply, save_obj, save_ply
-from rendra.ops import interpolate_face_attributes
+from rendra.loss import chamfer_distance, mesh_edge_loss, mesh_laplacian_smoothing, mesh_normal_consistency
+from rendra.ops import interpolate_face_attributes, sample_points_from_meshes
 from rendra.renderer import (
     AmbientLights,
     BlendParams,
@@ -591,3 +592,58 @@ def test_things_travel_to_workers_and_back(thing: object) -> None:
     assert type(returned) is type(thing)
     if isinstance(thing, Meshes):
         assert torch.equal(returned.textures.verts_features_packed(), thing.textures.verts_features_packed())
+
+
+# -- losses
+
+
+def test_optimization_of_a_shift():
+    """Chapter 2: how far three meshes were moved together, from noisy copies of them."""
+    torch.manual_seed(0)
+    mesh_source = join_meshes_as_batch([ico_sphere(1), ico_sphere(0).scale_verts(0.7), ico_sphere(0)])
+    noise = 0.02 * torch.randn_like(mesh_source.verts_packed())
+    mesh_target = mesh_source.offset_verts(torch.tensor([3.0, 4.0, 5.0]) + noise)
+    motion = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.SGD([motion], lr=0.1, momentum=0.9)
+    for _ in range(100):
+        optimizer.zero_grad()
+        moved = mesh_source.offset_verts(motion.expand(len(mesh_source.verts_packed()), 3))
+        sample_trg = sample_points_from_meshes(mesh_target, 300)
+        sample_src = sample_points_from_meshes(moved, 300)
+        loss, _ = chamfer_distance(sample_trg, sample_src)
+        loss.backward()
+        optimizer.step()
+    assert_close(motion.detach(), torch.tensor([3.0, 4.0, 5.0]), atol=0.1)
+
+
+def test_deforming_a_sphere_to_a_cloud(tmp_path):
+    """Chapter 3: four losses pull and smooth a sphere towards the vertices of a PLY file."""
+    torch.manual_seed(0)
+    target = ico_sphere(3).verts_packed() * torch.tensor([1.0, 0.6, 0.4]) + 5
+    save_ply(tmp_path / "target.ply", target, torch.zeros(0, 3, dtype=torch.int64))
+    verts, _ = load_ply(str(tmp_path / "target.ply"))
+    center = verts.mean(0)
+    verts = verts - center
+    scale = max(verts.abs().max(0)[0])
+    verts = (verts / scale)[None, :, :]
+    src_mesh = ico_sphere(2, device)
+    deform_verts = torch.full(src_mesh.verts_packed().shape, 0.0, device=device, requires_grad=True)
+    optimizer = torch.optim.SGD([deform_verts], lr=1.0, momentum=0.9)
+    history = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        new_src_mesh = src_mesh.offset_verts(deform_verts)
+        sample_src = sample_points_from_meshes(new_src_mesh, verts.shape[1])
+        loss_chamfer, _ = chamfer_distance(verts, sample_src)
+        loss_edge = mesh_edge_loss(new_src_mesh)
+        loss_normal = mesh_normal_consistency(new_src_mesh)
+        loss_laplacian = mesh_laplacian_smoothing(new_src_mesh, method="uniform")
+        loss = loss_chamfer * 1.0 + loss_edge * 1.0 + loss_normal * 0.01 + loss_laplacian * 0.1
+        history.append(loss_chamfer.item())
+        loss.backward()
+        optimizer.step()
+    assert history[-1] < 0.2 * history[0]
+    final_verts, final_faces = new_src_mesh.get_mesh_verts_faces(0)
+    final_verts = final_verts * scale + center
+    save_ply(tmp_path / "deform1.ply", final_verts.detach(), final_faces, ascii=True)
+    assert_close(load_ply(tmp_path / "deform1.ply")[0], final_verts.detach(), atol=1e-5)

@@ -42,7 +42,8 @@ NAMES = {
     "rendra.ops": """
         add_pointclouds_to_volumes add_points_features_to_volume_densities_features
         GraphConv SubdivideMeshes ball_query box3d_overlap convert_pointclouds_to_tensor
-        corresponding_points_alignment cot_laplacian cubify efficient_pnp estimate_pointcloud_local_coord_frames
+        corresponding_cameras_alignment corresponding_points_alignment cot_laplacian cubify efficient_pnp
+        estimate_pointcloud_local_coord_frames
         estimate_pointcloud_normals eyes get_point_covariances interpolate_face_attributes is_pointclouds
         iterative_closest_point knn_gather knn_points laplacian marching_cubes mesh_face_areas_normals
         norm_laplacian packed_to_padded padded_to_packed sample_farthest_points sample_points_from_meshes
@@ -80,7 +81,9 @@ NAMES = {
     "rendra.loss.point_mesh_distance": """
         edge_point_distance face_point_distance point_edge_distance point_face_distance point_mesh_edge_distance
         point_mesh_face_distance""",
-    "rendra.utils": "cameras_from_opencv_projection ico_sphere opencv_from_cameras_projection torus",
+    "rendra.utils": "cameras_from_opencv_projection checkerboard ico_sphere opencv_from_cameras_projection torus",
+    "rendra.utils.checkerboard": "checkerboard",
+    "rendra.ops.cameras_alignment": "corresponding_cameras_alignment",
     "rendra.utils.camera_conversions": "cameras_from_opencv_projection opencv_from_cameras_projection",
     "rendra.utils.ico_sphere": "ico_sphere",
     "rendra.utils.torus": "torus",
@@ -301,7 +304,13 @@ SIGNATURES = {
         "point_edge_distance": "points, points_first_idx, segms, segms_first_idx, max_points",
         "edge_point_distance": "points, points_first_idx, segms, segms_first_idx, max_segms",
     },
+    "rendra.ops.cameras_alignment": {
+        "corresponding_cameras_alignment": (
+            "cameras_src, cameras_tgt, estimate_scale=True, mode='extrinsics', eps=1e-9"
+        ),
+    },
     "rendra.utils": {
+        "checkerboard": "radius=4, color1=(0.0, 0.0, 0.0), color2=(1.0, 1.0, 1.0), device=None",
         "ico_sphere": "level=0, device=None",
         "torus": "r, R, sides, rings, device=None",
         "cameras_from_opencv_projection": "R, tvec, camera_matrix, image_size",

@@ -1,6 +1,7 @@
 """Operators on meshes, point clouds and grids."""
 
 from rendra.ops.ball_query import ball_query
+from rendra.ops.cameras_alignment import corresponding_cameras_alignment
 from rendra.ops.cubify import cubify
 from rendra.ops.graph_conv import GraphConv
 from rendra.ops.interp_face_attrs import interpolate_face_attributes
@@ -38,6 +39,7 @@ __all__ = [
     "ball_query",
     "box3d_overlap",
     "convert_pointclouds_to_tensor",
+    "corresponding_cameras_alignment",
     "corresponding_points_alignment",
     "cot_laplacian",
     "cubify",

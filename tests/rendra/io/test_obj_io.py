@@ -354,7 +354,7 @@ def test_a_failing_write_leaves_the_old_file(tmp_path, monkeypatch):
     path.write_text("old")
 
     def full_disk(*_: object) -> None:
-        raise OSError("no space left")
+        raise OSError(28, "no space left")
 
     monkeypatch.setattr("rendra.io._source.os.replace", full_disk)
     with pytest.raises(OSError, match="no space left"):
