@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     from rendra_lab.mesh_asset import read_asset
     from rendra_lab.mesh_report import as_json, as_text, report_on
-    from rendra_lab.mesh_sheet import NothingToSee, draw_sheet
+    from rendra_lab.mesh_sheet import NothingToSeeError, draw_sheet
     from rendra_lab.visualization import save_picture
 
     remarks = []
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not options.no_picture:
             output = options.output or Path(f"{options.file.stem}_inspected.png")
             remarks.append(f"wrote {save_picture(output, draw_sheet(asset, findings, options.size))}")
-    except NothingToSee as error:
+    except NothingToSeeError as error:
         remarks.append(f"no picture: {error}")
     except (ValueError, OSError) as error:
         sys.stderr.write(f"inspect.py: {' '.join(str(error).split())}\n")

@@ -39,7 +39,7 @@ _MOST_MAPS = 6
 _MATTE = Materials(specular_color=((0.0, 0.0, 0.0),))
 
 
-class NothingToSee(ValueError):
+class NothingToSeeError(ValueError):
     """No picture can show what is in a file."""
 
 
@@ -56,7 +56,7 @@ def draw_sheet(asset: Asset, findings: Findings | None, size: int = 320) -> Pict
         uint8 (H, W, 3), captioned pictures in rows of three.
 
     Raises:
-        NothingToSee: there is no finite point, or all are in one place.
+        NothingToSeeError: there is no finite point, or all are in one place.
     """
     return tile(list(_pictures(asset, findings, size)), columns=3)
 
@@ -64,7 +64,7 @@ def draw_sheet(asset: Asset, findings: Findings | None, size: int = 320) -> Pict
 def _pictures(asset: Asset, findings: Findings | None, size: int) -> Iterator[Picture]:
     shown = _dressed(asset) if asset.cloud is None else cloud_as_mesh(asset.cloud)
     if not len(shown.faces_packed()) or not bounding_sphere(shown)[1] > 0:
-        raise NothingToSee(f"{asset.path.name} has no extent, so there is nothing to draw")
+        raise NothingToSeeError(f"{asset.path.name} has no extent, so there is nothing to draw")
     shading = Shading(HardPhongShader())
     for name, camera in _SIDES.items():
         image = Studio(camera, Headlight(), _MATTE, shading, (size, size)).render(shown)

@@ -69,6 +69,13 @@ def test_files_that_are_malformed_or_missing_are_mistakes(program: Train, tmp_pa
         assert err.count("\n") == 1
 
 
+def test_a_cloud_cannot_be_localized(program: Train, tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n")
+    code, _, err = program("train.py", "task=localize", f"data.paths=[{tmp_path / 'a.xyz'}]")
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith("train.py: data.paths: No mesh interpreter found to read")
+
+
 @pytest.mark.parametrize(
     ("argument", "answer"),
     [

@@ -15,7 +15,7 @@ from rendra.utils import ico_sphere
 from rendra_lab.data.meshes import make_cube
 from rendra_lab.mesh_asset import Asset, read_asset
 from rendra_lab.mesh_report import CloudReport, MeshReport, as_json, as_text, report_on
-from rendra_lab.mesh_sheet import NothingToSee, cloud_as_mesh, draw_sheet
+from rendra_lab.mesh_sheet import NothingToSeeError, cloud_as_mesh, draw_sheet
 
 TEXTURED = """mtllib a.mtl
 v 0 0 0
@@ -151,7 +151,7 @@ def test_json_holds_every_number_and_no_nan(tmp_path: Path) -> None:
     assert "1 degenerate face" in numbers["verdict"]
     for words in ("a single point", "3 vertices, 1 face, ", "no two faces share an edge", "not a closed manifold"):
         assert words in as_text(report)
-    with pytest.raises(NothingToSee, match="no extent"):
+    with pytest.raises(NothingToSeeError, match="no extent"):
         draw_sheet(asset, findings)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
+from rendra.io.errors import MeshFormatError
 from rendra.ops import sample_points_from_meshes
 from rendra.structures import Meshes, join_meshes_as_batch
 from rendra_lab.data.meshes import load_mesh
@@ -147,7 +148,9 @@ def _check_settings(displacement: Sequence[float], noise_variance: float, measur
 def _read(path: Path) -> Meshes:
     try:
         return load_mesh(path=path)
-    except FileNotFoundError as error:
+    except MeshFormatError:
+        raise
+    except (FileNotFoundError, ValueError) as error:  # ValueError: no format has its suffix, or it holds no faces
         raise UserError(f"data.paths: {error}") from error
 
 
