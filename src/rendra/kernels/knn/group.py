@@ -28,7 +28,7 @@ from rendra.kernels.knn.lanes import (
     write_int64,
 )
 from rendra.kernels.knn.search import promising_lane
-from rendra.kernels.knn.tree import BLOCK, LEAF, MAX_LEVELS, NOTHING
+from rendra.kernels.knn.tree import BLOCK, MAX_LEVELS, NOTHING
 from rendra.kernels.parallel import scalar_kernel
 
 GROUP_SCRATCH = 3 * MAX_LEVELS + 2 * LANES  # int64 numbers that a walk needs
@@ -38,7 +38,7 @@ _UNTOUCHABLE = np.float32(-1)
 
 
 class Group(NamedTuple):
-    """The scratch of one thread, by address: see `search.Walk`; then what the queries found, and the box about them."""
+    """The scratch of one thread, by address: that of `search.Walk`, what the queries found, the box about them."""
 
     roots: int
     blocks: int
@@ -57,7 +57,7 @@ def group_at(address):
 
 @scalar_kernel
 def nearest_of_group(queries, count, tree, levels, norm, seed, group):
-    """Leave in `group.best` what is nearest to each of the first `count` queries, which lie at an address as in a leaf.
+    """Leave in `group.best` what is nearest to each of the first `count` queries, at an address as in a leaf.
 
     The leaf `seed` is looked at first, if it is not negative. Queries that stand at -infinity keep a distance of -1.
     Returns how many times 16 queries looked at a leaf.

@@ -102,6 +102,10 @@ def _larger(builder: Any, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
+def _smaller(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
 def _bits(builder: Any, lanes: Any) -> Any:
     """Sixteen truths as an int64."""
     return builder.zext(builder.bitcast(lanes, ir.IntType(LANES)), ir.IntType(64))
@@ -172,8 +176,54 @@ A lane matters whose distance is below `cut`, or equal to it with an index below
 """
 
 
-# What follows compares 16 queries, whose coordinates lie at the address `queries` as in a leaf, and the best that each
-# has found, which lies at the address `best`: 16 distances, 16 indices, 16 slots. A distance of -1 is never improved.
+def _fold(builder: Any, vector: Any, choose: Callable[..., Any]) -> Any:
+    """One of the sixteen, the same as choosing between two at a time."""
+    for step in (8, 4, 2, 1):
+        places = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [(lane + step) % LANES for lane in range(LANES)])
+        vector = choose(builder, vector, builder.shuffle_vector(vector, vector, places))
+    return builder.extract_element(vector, ir.Constant(ir.IntType(32), 0))
+
+
+@intrinsic
+def lowest_of(typingctx, numbers, first, indices, first_index, nothing):  # type: ignore[no-untyped-def]
+    """The lowest of 16 float32, but for those whose int32 index is `nothing`; infinity if all are."""
+
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        numbers, first, indices, first_index, nothing = arguments
+        index = _load(builder, indices, first_index, ir.IntType(32), _INTS)
+        counts = builder.icmp_signed("!=", index, _repeat(builder, nothing, _INTS))
+        vector = _load(builder, numbers, first, ir.FloatType(), _FLOATS)
+        vector = builder.select(counts, vector, ir.Constant(_FLOATS, [float("inf")] * LANES))
+        return _fold(builder, vector, _smaller)
+
+    return types.float32(*(types.int64,) * 4, types.int32), codegen
+
+
+@intrinsic
+def highest_of(typingctx, numbers, first):  # type: ignore[no-untyped-def]
+    """The highest of 16 float32."""
+
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return _fold(builder, _load(builder, *arguments, ir.FloatType(), _FLOATS), _larger)
+
+    return types.float32(types.int64, types.int64), codegen
+
+
+@intrinsic
+def lowest_index_of(typingctx, indices, first):  # type: ignore[no-untyped-def]
+    """The lowest of 16 int32."""
+
+    def smaller(builder, a, b):  # type: ignore[no-untyped-def]
+        return builder.select(builder.icmp_signed("<", a, b), a, b)
+
+    def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return _fold(builder, _load(builder, *arguments, ir.IntType(32), _INTS), smaller)
+
+    return types.int32(types.int64, types.int64), codegen
+
+
+# What follows compares 16 queries, whose coordinates lie at the address `queries` as in a leaf, and the best they
+# have found, which lies at the address `best`: 16 distances, 16 indices, 16 slots. A distance of -1 stays.
 
 
 def _best(builder: Any, best: Any) -> list[Any]:
@@ -262,15 +312,15 @@ def _boxes_for_box(norm: int) -> Callable[..., Any]:
 def worst_of(typingctx, best):  # type: ignore[no-untyped-def]
     """The bits of the largest distance among the best, and the highest index at that distance; int32 both."""
 
+    def larger(builder, a, b):  # type: ignore[no-untyped-def]
+        return builder.select(builder.icmp_signed(">", a, b), a, b)
+
     def codegen(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         dists, indices, _ = _best(builder, arguments[0])
-        bits = builder.bitcast(dists, _INTS)
-        int32 = ir.IntType(32)
-        name = f"llvm.vector.reduce.smax.v{LANES}i32"
-        largest = builder.module.declare_intrinsic(name, fnty=ir.FunctionType(int32, [_INTS]))
-        worst = builder.call(largest, [bits])
+        bits = builder.bitcast(dists, _INTS)  # order as the distances do; those of -1 are negative
+        worst = _fold(builder, bits, larger)
         there = builder.icmp_signed("==", bits, _repeat(builder, worst, _INTS))
-        index = builder.call(largest, [builder.select(there, indices, ir.Constant(_INTS, [-1] * LANES))])
+        index = _fold(builder, builder.select(there, indices, ir.Constant(_INTS, [-1] * LANES)), larger)
         return context.make_tuple(builder, signature.return_type, (worst, index))
 
     return types.UniTuple(types.int32, 2)(types.int64), codegen

@@ -60,6 +60,10 @@ def search(
     scratch = np.empty((workers, SCRATCH + K), np.int64)
     squared = np.float32(radius) * np.float32(radius) if radius >= 0 else np.float32(-1)
     _build(*clouds, *lengths, axes, first, second, workers)
+    if K == 1 and radius < 0 and clouds[0].shape[2] <= 3:
+        grouped = np.empty((workers, GROUP_SCRATCH), np.int64)
+        trees = _addresses(*first), _addresses(*second)
+        return int(_search_one(*lengths, norm, clouds[1].shape[1], *trees, dists, idx, grouped, grouped.ctypes.data))
     return int(
         _search(
             (clouds[0].shape[1], clouds[1].shape[1], clouds[0].shape[2], K), *lengths, norm, squared,
@@ -162,6 +166,34 @@ def _search(shape, lengths1, lengths2, norm, radius, clouds, first, second, outp
                 seen += looks
                 sort_heap(walk.heap, ask.size)
                 _write(walk.heap, ask, outputs[0] + 4 * K * i, outputs[1] + 8 * K * i)
+        looked_at += seen
+    return looked_at
+
+
+@parallel_kernel
+def _search_one(lengths1, lengths2, norm, P2, first, second, dists, idx, scratch, scratch_address):
+    """The same for the nearest point alone, in at most three dimensions: 16 queries at once."""
+    batch, P1, _ = dists.shape
+    slots, (leaves, blocks) = _num_slots(P1), tree_size(P2)
+    chunks = (slots + _GROUPED_AT_ONCE - 1) // _GROUPED_AT_ONCE
+    workers, looked_at = len(scratch), 0
+    for worker in prange(workers):
+        group = group_at(scratch_address + 8 * scratch.shape[1] * worker)
+        seen = 0
+        for chunk in range(worker, batch * chunks, workers):
+            n = chunk // chunks
+            tree, levels = tree_at(second, leaves, blocks, n), find_roots(lengths2[n], group.roots)
+            own, order = first[0] + 4 * 3 * slots * n, first[1] + 4 * slots * n
+            begin, seed = chunk % chunks * _GROUPED_AT_ONCE, np.int64(-1)
+            end = min(begin + _GROUPED_AT_ONCE, lengths1[n]) if lengths2[n] else begin
+            for slot in range(begin, end, LANES):
+                count, place = min(LANES, end - slot), np.int32(0)
+                seen += nearest_of_group(own + 4 * 3 * slot, count, tree, levels, norm, seed, group)
+                for lane in range(count):
+                    dist, index, place = found_by(group, lane)
+                    i = read_int32(order, slot + lane)
+                    dists[n, i, 0], idx[n, i, 0] = dist, index
+                seed = np.int64(place) // LANES
         looked_at += seen
     return looked_at
 

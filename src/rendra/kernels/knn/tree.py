@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from rendra.kernels.knn.lanes import LANES
+from rendra.kernels.knn.lanes import LANES, highest_of, lowest_index_of, lowest_of
 from rendra.kernels.parallel import scalar_kernel
 
 NOTHING = np.int32(2**31 - 1)
@@ -47,13 +47,16 @@ def build_tree(points, length, axes, leaves, indices, boxes, lowest):
 
     points (P, D); `axes` (3,) names the coordinates that the tree knows, -1 for zero.
     """
-    codes = _along_the_curve(points, length, axes)
+    coords = np.empty((3, length), np.float32)
+    for i in range(length):
+        coords[0, i], coords[1, i], coords[2, i] = _place(points, i, axes)
+    codes = _along_the_curve(coords, length)
     num_leaves = (length + LANES - 1) // LANES
     for i in range(num_leaves * LANES):
         place = i // LANES * LEAF + i % LANES
         index = codes[i] & INDEX_MASK if i < length else np.int64(NOTHING)
-        x, y, z = _place(points, index, axes) if i < length else (_FAR, _FAR, _FAR)
-        leaves[place], leaves[place + LANES], leaves[place + 2 * LANES] = x, y, z
+        for axis in range(3):
+            leaves[place + axis * LANES] = coords[axis, index] if i < length else _FAR
         indices[i] = index
     _box_leaves(leaves, indices, num_leaves, boxes, lowest)
     level, count = 0, (num_leaves + LANES - 1) // LANES
@@ -74,13 +77,13 @@ def _place(points, i, axes):
 
 
 @scalar_kernel
-def _along_the_curve(points, length, axes):
+def _along_the_curve(coords, length):
     """Indices (length,) of the points in the order of the tree, in the low bits; equal points by index."""
     codes, spare = np.empty(length, np.int64), np.empty(length, np.int64)
     cells, counts = np.empty((3, length), np.int32), np.empty((3, _CELLS), np.int64)
     end = 0
     for i in range(length):
-        if _place(points, i, axes)[0] > _FAR:
+        if coords[0, i] > _FAR:
             codes[end] = i
             end += 1
         else:
@@ -92,7 +95,7 @@ def _along_the_curve(points, length, axes):
     while waiting:
         waiting -= 1
         begin, end = starts[waiting], ends[waiting]
-        if not _sort_range(points, axes, codes, spare, cells, counts, begin, end):
+        if not _sort_range(coords, codes, spare, cells, counts, begin, end):
             continue
         run = begin
         for i in range(begin + 1, end + 1):
@@ -105,12 +108,13 @@ def _along_the_curve(points, length, axes):
 
 
 @scalar_kernel
-def _sort_range(points, axes, codes, spare, cells, counts, begin, end):
+def _sort_range(coords, codes, spare, cells, counts, begin, end):
     """Sort codes[begin:end] along a curve through their box; False where all points coincide."""
     low_x = low_y = low_z = np.float32(np.inf)
     high_x = high_y = high_z = _FAR
     for i in range(begin, end):
-        x, y, z = _place(points, codes[i] & INDEX_MASK, axes)
+        index = codes[i] & INDEX_MASK
+        x, y, z = coords[0, index], coords[1, index], coords[2, index]
         low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
         high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
     # in float64: the difference of two float32 numbers may overflow
@@ -119,7 +123,8 @@ def _sort_range(points, axes, codes, spare, cells, counts, begin, end):
         return False
     scale = (_CELLS - 0.001) / extent
     for i in range(begin, end):
-        x, y, z = _place(points, codes[i] & INDEX_MASK, axes)
+        index = codes[i] & INDEX_MASK
+        x, y, z = coords[0, index], coords[1, index], coords[2, index]
         cells[0, i] = np.int32((np.float64(x) - low_x) * scale)
         cells[1, i] = np.int32((np.float64(y) - low_y) * scale)
         cells[2, i] = np.int32((np.float64(z) - low_z) * scale)
@@ -188,20 +193,13 @@ def _spread(bits):
 def _box_leaves(leaves, indices, num_leaves, boxes, lowest):
     """The blocks right above the leaves."""
     _clear(boxes, lowest, 0, (num_leaves + LANES - 1) // LANES)
+    points, ids = leaves.ctypes.data, indices.ctypes.data
     for leaf in range(num_leaves):
         place = leaf // LANES * BLOCK + leaf % LANES
-        least = NOTHING
         for axis in range(3):
-            low, high = np.float32(np.inf), _FAR
-            for lane in range(LANES):
-                value = leaves[leaf * LEAF + axis * LANES + lane]
-                low = min(low, value) if indices[leaf * LANES + lane] != NOTHING else low
-                high = max(high, value)
-            boxes[place + axis * LANES] = low
-            boxes[place + (3 + axis) * LANES] = high
-        for lane in range(LANES):
-            least = min(least, indices[leaf * LANES + lane])
-        lowest[leaf] = least
+            boxes[place + axis * LANES] = lowest_of(points, leaf * LEAF + axis * LANES, ids, leaf * LANES, NOTHING)
+            boxes[place + (3 + axis) * LANES] = highest_of(points, leaf * LEAF + axis * LANES)
+        lowest[leaf] = lowest_index_of(ids, leaf * LANES)
 
 
 @scalar_kernel
@@ -209,22 +207,16 @@ def _box_blocks(boxes, lowest, level, count):
     """The blocks above the `count` blocks of a level that starts at block `level`."""
     above = level + count
     _clear(boxes, lowest, above, (count + LANES - 1) // LANES)
+    numbers, ids = boxes.ctypes.data, lowest.ctypes.data
     for child in range(count):
         source = (level + child) * BLOCK
         place = (above + child // LANES) * BLOCK + child % LANES
         first = (level + child) * LANES
-        least = NOTHING
         for axis in range(3):
-            low, high = np.float32(np.inf), _FAR
-            for lane in range(LANES):
-                if lowest[first + lane] != NOTHING:
-                    low = min(low, boxes[source + axis * LANES + lane])
-                    high = max(high, boxes[source + (3 + axis) * LANES + lane])
-            boxes[place + axis * LANES] = low
-            boxes[place + (3 + axis) * LANES] = high
-        for lane in range(LANES):
-            least = min(least, lowest[first + lane])
-        lowest[above * LANES + child] = least
+            low, high = source + axis * LANES, source + (3 + axis) * LANES
+            boxes[place + axis * LANES] = lowest_of(numbers, low, ids, first, NOTHING)
+            boxes[place + (3 + axis) * LANES] = highest_of(numbers, high)
+        lowest[above * LANES + child] = lowest_index_of(ids, first)
 
 
 @scalar_kernel
