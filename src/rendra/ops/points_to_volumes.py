@@ -144,26 +144,26 @@ def _votes(places: Tensor, wanted: Tensor, rows: Tensor, sizes: Tensor, grids: T
     Returns:
         (N, K, D, H, W).
     """
+    is_trilinear = mode == "trilinear"
     depth, height, width = grids.shape[2:]
-    first = places.floor() if mode == "trilinear" else places.round()
-    beyond = places - first
-    corners = list(product((0.0, 1.0), repeat=3)) if mode == "trilinear" else [(0.0, 0.0, 0.0)]
-    volume = torch.arange(len(places), device=places.device)[:, None]
     lost = len(places) * depth * height * width  # one more voxel, for what no grid takes
-    total = rows.new_zeros(lost + 1, rows.shape[2])
-    for corner in corners:
-        step = places.new_tensor(corner)
-        voxel = first + step
-        inside = ((voxel >= 0) & (voxel < sizes)).all(2) & wanted
-        x, y, z = voxel.where(inside[..., None], 0).long().unbind(2)
+    spots = places.flatten(0, 1).T  # (3, N P): long rows are what runs fast
+    limits = sizes.expand_as(places).flatten(0, 1).T
+    values = rows.flatten(0, 1).T.contiguous()  # (K, N P)
+    wanted = wanted.flatten()
+    volume = torch.arange(len(places), device=places.device).repeat_interleave(places.shape[1])
+    first = spots.floor() if is_trilinear else spots.round()
+    share = torch.stack([1 - (spots - first), spots - first]).to(rows.dtype)
+    total = rows.new_zeros(len(values), lost + 1)
+    for dx, dy, dz in product((0, 1), repeat=3) if is_trilinear else [(0, 0, 0)]:
+        voxel = torch.stack([first[0] + dx, first[1] + dy, first[2] + dz])
+        inside = ((voxel >= 0) & (voxel < limits)).all(0) & wanted
+        x, y, z = voxel.where(inside, 0).long()
         index = (((volume * depth + z) * height + y) * width + x).where(inside, lost)
-        added = rows
-        if mode == "trilinear":
-            along_x, along_y, along_z = torch.where(step == 1, beyond, 1 - beyond).unbind(2)
-            added = rows * (along_x * along_y * along_z)[..., None].to(rows.dtype)
-        total.index_add_(0, index.flatten(), added.flatten(0, 1))
-    shape = (len(places), depth, height, width, rows.shape[2])
-    return total[:lost].view(shape).permute(0, 4, 1, 2, 3).contiguous()
+        added = values * (share[dx, 0] * share[dy, 1] * share[dz, 2]) if is_trilinear else values
+        total.scatter_add_(1, index.expand_as(added), added)
+    voxels = total[:, :lost].reshape(len(values), len(places), depth, height, width)
+    return voxels.transpose(0, 1).contiguous()
 
 
 def _check_points(points: Tensor, features: Tensor, densities: Tensor, mask: Tensor | None) -> None:
