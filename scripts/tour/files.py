@@ -32,7 +32,6 @@ f -2//1 -3//1 -1//1
 MTL = "newmtl wall\nKd 0.9 0.8 0.6\nnewmtl roof\nKd 0.7 0.2 0.1\nNs 20\n"
 
 
-
 def main(file: str | None = None) -> None:
     """Reads the user's OBJ file, or a house of one square wall and a triangular roof."""
     with tempfile.TemporaryDirectory() as folder:
