@@ -52,9 +52,9 @@ def main(file: str | None = None) -> None:
         for name, colours in (properties.material_colors or {}).items():
             print(f"material {name}:", {key: rounded(value) for key, value in colours.items()})
         print("texture images:", list(properties.texture_images or {}) or "none")
-        save_obj(Path(folder) / "copy.obj", verts, faces.verts_idx, decimal_places=12)  # else 6, which rounds
+        save_obj(Path(folder) / "copy.obj", verts, faces.verts_idx, decimal_places=12)  # else 6
         again, _, _ = load_obj(Path(folder) / "copy.obj")
-        print(f"written as OBJ and read again: same={torch.equal(again, verts)}")
+        print(f"written as OBJ and read again: same={torch.allclose(again, verts)}")
         save_ply(Path(folder) / "copy.ply", verts, faces.verts_idx)  # binary; ascii=True for text
         again, faces_again = load_ply(Path(folder) / "copy.ply")
         print(f"written as PLY and read again: same={torch.equal(again, verts)}, {len(faces_again)} triangles")

@@ -77,6 +77,15 @@ def test_a_cloud_cannot_be_localized(program: Train, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "setting", ["data.displacement=[1.0,2.0,1e30]", "module.start=[nan,0.0,0.0]", "module.start=[0.0]"]
+)
+def test_a_displacement_is_three_numbers(setting: str, program: Train) -> None:
+    code, _, err = program("train.py", "task=localize", setting)
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith(f"train.py: {setting.partition('=')[0]} must be three numbers such as [")
+
+
+@pytest.mark.parametrize(
     ("argument", "answer"),
     [
         ("data.name=dog", "there is no mesh 'dog'; there are cow, ico_sphere, torus, cube, or give a path"),

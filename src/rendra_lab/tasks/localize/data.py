@@ -21,6 +21,9 @@ from rendra_lab.records import TensorRecord
 from rendra_lab.tasks.localize.solids import SOLIDS, subdivided
 
 
+_FARTHEST = 1e15  # single precision squares it
+
+
 @dataclass(frozen=True)
 class SightBatch(TensorRecord):
     """One look at N meshes of different sizes, in the units of their files."""
@@ -134,7 +137,8 @@ class SeenSolids(LightningDataModule):
 
 
 def _check_settings(displacement: Sequence[float], noise_variance: float, measurements: int, samples: int) -> None:
-    if len(displacement) != 3 or not all(math.isfinite(each) for each in displacement):
+    numbers = all(isinstance(each, int | float) for each in displacement)
+    if len(displacement) != 3 or not numbers or not all(abs(each) <= _FARTHEST for each in displacement):
         raise UserError(f"data.displacement must be three numbers such as [3,4,5], got {list(displacement)}")
     for key, value, least, most in (
         ("noise_variance", noise_variance, 0, 1e12),

@@ -8,6 +8,7 @@ Shapes: N meshes of different sizes, S samples of each.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -42,7 +43,7 @@ class Localize(Task[SightBatch, DisplacementPrediction]):
 
     def __init__(self, start: Sequence[float] = (0.0, 0.0, 0.0), **parts: Any) -> None:
         super().__init__(**parts)
-        if len(start) != 3:
+        if len(start) != 3 or not all(isinstance(each, int | float) and math.isfinite(each) for each in start):
             raise ValueError(f"module.start must be three numbers such as [0,0,0], got {list(start)}")
         self.displacement = nn.Parameter(torch.tensor([[float(each) for each in start]]))
 
