@@ -20,7 +20,6 @@ from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
 from rendra_lab.tasks.localize.solids import SOLIDS, subdivided
 
-
 _FARTHEST = 1e15  # single precision squares it
 
 
