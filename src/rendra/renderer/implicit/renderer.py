@@ -177,7 +177,7 @@ class VolumeSampler(nn.Module):
             values = self._sampled(padded, places)
         else:  # local coordinates are those of each volume without its padding
             values = torch.cat([self._sampled(grid[None], at[None]) for grid, at in zip(own, places, strict=True)])
-        return values[:, :, 0, 0].transpose(1, 2).reshape(*points.shape[:-1], padded.shape[1])
+        return values.reshape(*values.shape[:2], *points.shape[1:-1]).movedim(1, -1)
 
     def _sampled(self, grids: Tensor, places: Tensor) -> Tensor:
         """(N, C, 1, 1, points of each)"""
