@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -62,11 +63,15 @@ def _cubify(library: Library, scene: Scene) -> Run:
     return lambda: library.ops.cubify(voxels, 0.0)
 
 
-def _cubify_reference(library: Library, scene: Scene) -> Run:
-    from rendra.kernels.cubify.reference import cubify
+def _cubify_kernel(module: str) -> Callable[[Library, Scene], Run]:
+    """The kernel, or its specification, alone."""
 
-    voxels, planes = _voxels(scene.device), torch.arange(49.0, device=scene.device)
-    return lambda: cubify(voxels, 0.0, planes, planes, planes)
+    def prepare(library: Library, scene: Scene) -> Run:
+        voxels, planes = _voxels(scene.device), torch.arange(49.0, device=scene.device)
+        cubify = import_module(module).cubify
+        return lambda: cubify(voxels, 0.0, planes, planes, planes)
+
+    return prepare
 
 
 def _mesh_loss(name: str) -> Callable[[Library, Scene], Run]:
@@ -150,8 +155,12 @@ GEOMETRY: tuple[Benchmark, ...] = (
         10,
     ),
     Benchmark("cubify", "cubify, 16 grids of 48^3", _cubify, _CUBIFY),
-    Benchmark(
-        "cubify_reference", "the reference of cubify, 16 grids of 48^3", _cubify_reference, _CUBIFY, is_public=False
+    *(
+        Benchmark(f"cubify_{name}", f"{what}, 16 grids of 48^3", _cubify_kernel(module), _CUBIFY, is_public=False)
+        for name, what, module in (
+            ("kernel", "the kernel of cubify alone", "rendra.kernels.cubify"),
+            ("reference", "its reference", "rendra.kernels.cubify.reference"),
+        )
     ),
     *(
         Benchmark(name, f"{name}, 5,120 faces, {_BACK}", _mesh_loss(name), _MESH_LOSSES)
