@@ -207,16 +207,29 @@ def test_results_do_not_depend_on_threads():
 
 @pytest.mark.parametrize("queries", [*KINDS, "apart"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_work_stays_far_from_quadratic(queries, kind):
-    """Leaves that are looked at per query, of 313: thirty at most, however the clouds lie."""
+@pytest.mark.parametrize(("K", "limit"), [(1, 5), (2, 30)])
+def test_work_stays_far_from_quadratic(queries, kind, K, limit):
+    """Looks at leaves per query, of 313 (K = 2), or of 20, as 16 queries look at once (K = 1), however they lie."""
     p1 = cloud("even", 2000, 1) + 100 if queries == "apart" else cloud(queries, 2000, 1)
     p2, axes = cloud(kind, 5000, 2), torch.arange(3).numpy()
-    dists, idx = torch.zeros(1, 2000, 1), torch.full((1, 2000, 1), -1)
+    dists, idx = torch.zeros(1, 2000, K), torch.full((1, 2000, K), -1)
     looks = numba_cpu.search(
         (p1[None].numpy(), p2[None].numpy()), (lengths(2000).numpy(), lengths(5000).numpy()), axes, 2, -1.0,
         dists.numpy(), idx.numpy(),
     )  # fmt: skip
-    assert looks <= 30 * 2000
+    assert looks <= limit * 2000
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("norm", [1, 2])
+def test_one_neighbour_is_the_first_of_two(kind, norm):
+    """One is searched for 16 queries at once, two are not: independent walks, the same answer to the bit."""
+    p1, p2 = cloud("even", 777, 1)[None], cloud(kind, 3000, 2)[None]
+    p1[0, [5, 300]], p2[0, 11] = float("nan"), float("inf")
+    for a, b in ((p1, p2), (p2, p1), (p2, p2)):
+        one, two = (nearest_points(a, b, whole(a), whole(b), norm, K) for K in (1, 2))
+        assert torch.equal(one[0][..., 0], two[0][..., 0])
+        assert torch.equal(one[1][..., 0], two[1][..., 0])
 
 
 def test_operators_are_well_registered():

@@ -1,8 +1,9 @@
 """Nearest points on the CPU: the fast twin of `reference.py`.
 
 Each cloud is sorted along a curve, 16 points to a leaf; queries walk down the tree of the other cloud in the order of
-their own curve, so that the neighbours of one bound the search of the next. Gradients are gathered by the points that
-receive them. Notation: N clouds, P1 and P2 points, D coordinates, K neighbours; a slot is a place in the leaves.
+their own curve, so that the neighbours of one bound the search of the next, and 16 at once where only the nearest is
+asked for in at most three dimensions. Gradients are gathered by the points that receive them. Notation: N clouds, P1
+and P2 points, D coordinates, K neighbours; a slot is a place in the leaves.
 """
 
 import math
@@ -51,7 +52,7 @@ def search(
     dists: np.ndarray,
     idx: np.ndarray,
 ) -> int:
-    """Write dists and idx (N, P1, K) where there are neighbours; returns how many leaves were looked at.
+    """Write dists and idx (N, P1, K) where there are neighbours; returns how many looks at a leaf that took.
 
     A negative radius asks for the nearest points. `axes` (3,) names the coordinates that the trees know, -1 for none.
     """
@@ -90,7 +91,7 @@ def nearest_sums(
     norm: int,
     grads: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, int]:
-    """Sums (N,) both ways, and how many leaves were looked at; D at most 3.
+    """Sums (N,) both ways, and how many looks at a leaf that took; D at most 3.
 
     Writes the gradients, every element; one that is not wanted has no elements.
     """
