@@ -17,6 +17,7 @@ from rendra.ops.points_alignment import corresponding_points_alignment, iterativ
 from rendra.ops.points_normals import estimate_pointcloud_local_coord_frames, estimate_pointcloud_normals
 from rendra.ops.points_to_volumes import add_pointclouds_to_volumes, add_points_features_to_volume_densities_features
 from rendra.ops.sample_farthest_points import sample_farthest_points
+from rendra.ops.sample_pdf import sample_pdf
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
 from rendra.ops.self_intersections import self_intersections
 from rendra.ops.subdivide_meshes import SubdivideMeshes
@@ -61,6 +62,7 @@ __all__ = [
     "packed_to_padded",
     "padded_to_packed",
     "sample_farthest_points",
+    "sample_pdf",
     "sample_points_from_meshes",
     "self_intersections",
     "taubin_smoothing",

@@ -1,5 +1,14 @@
 """Rays through space, what marchers make of the samples along them, and renderers of fields and volumes."""
 
+from rendra.renderer.implicit.harmonic_embedding import HarmonicEmbedding
+from rendra.renderer.implicit.raymarching import AbsorptionOnlyRaymarcher, EmissionAbsorptionRaymarcher
+from rendra.renderer.implicit.raysampling import (
+    GridRaysampler,
+    MonteCarloRaysampler,
+    MultinomialRaysampler,
+    NDCGridRaysampler,
+    NDCMultinomialRaysampler,
+)
 from rendra.renderer.implicit.renderer import ImplicitRenderer, VolumeRenderer, VolumeSampler
 from rendra.renderer.implicit.utils import (
     HeterogeneousRayBundle,
@@ -9,8 +18,16 @@ from rendra.renderer.implicit.utils import (
 )
 
 __all__ = [
+    "AbsorptionOnlyRaymarcher",
+    "EmissionAbsorptionRaymarcher",
+    "GridRaysampler",
+    "HarmonicEmbedding",
     "HeterogeneousRayBundle",
     "ImplicitRenderer",
+    "MonteCarloRaysampler",
+    "MultinomialRaysampler",
+    "NDCGridRaysampler",
+    "NDCMultinomialRaysampler",
     "RayBundle",
     "VolumeRenderer",
     "VolumeSampler",
