@@ -96,7 +96,7 @@ NAMES = {
         MeshRendererWithFragments OpenGLOrthographicCameras OpenGLPerspectiveCameras OrthographicCameras
         PerspectiveCameras PointLights RasterizationSettings SfMOrthographicCameras SfMPerspectiveCameras
         SoftDepthShader SoftGouraudShader SoftPhongShader SoftSilhouetteShader SplatterPhongShader TensorProperties
-        TexturesAtlas TexturesUV TexturesVertex camera_position_from_spherical_angles
+        TexturesAtlas TexturesUV TexturesVertex VolumeRenderer VolumeSampler camera_position_from_spherical_angles
         convert_to_tensors_and_broadcast diffuse get_world_to_view_transform gouraud_shading hard_rgb_blend
         look_at_rotation look_at_view_transform ndc_grid_sample ndc_to_grid_sample_coords phong_shading
         rasterize_meshes rotate_on_spot sigmoid_alpha_blend softmax_rgb_blend specular""",
@@ -113,6 +113,7 @@ NAMES = {
     "rendra.renderer.utils": """
         TensorAccessor TensorProperties convert_to_tensors_and_broadcast format_tensor ndc_grid_sample
         ndc_to_grid_sample_coords parse_image_size""",
+    "rendra.renderer.implicit.renderer": "ImplicitRenderer VolumeRenderer VolumeSampler",
     "rendra.renderer.mesh": """
         HardPhongShader MeshRasterizer MeshRenderer RasterizationSettings SoftPhongShader SoftSilhouetteShader
         TexturesAtlas TexturesUV TexturesVertex gouraud_shading phong_shading rasterize_meshes""",
@@ -393,6 +394,10 @@ SIGNATURES = {
         "rasterize_meshes": """meshes, image_size=256, blur_radius=0.0, faces_per_pixel=8, bin_size=None,
             max_faces_per_bin=None, perspective_correct=False, clip_barycentric_coords=False, cull_backfaces=False,
             z_clip_value=None, cull_to_frustum=False""",
+        "VolumeRenderer": "raysampler, raymarcher, sample_mode='bilinear'",
+        "VolumeRenderer.forward": "self, cameras, volumes, **kwargs",
+        "VolumeSampler": "volumes, sample_mode='bilinear', padding_mode='zeros'",
+        "VolumeSampler.forward": "self, ray_bundle, **kwargs",
         "MeshRenderer": "rasterizer, shader",
         "MeshRenderer.forward": "self, meshes_world, **kwargs",
         "MeshRendererWithFragments": "rasterizer, shader",
