@@ -15,6 +15,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 
+from rendra.io import IO
 from rendra_lab import report, visualization
 from rendra_lab.base_task import BaseTask
 from rendra_lab.errors import UserError
@@ -289,12 +290,20 @@ class MeshLogger(Callback):
         folder: of the files.
         every_n_steps: interval during the fit; 0 shows the end alone.
         formats: of the files, each an ending that `rendra.io.IO` writes, such as ply.
+
+    Raises:
+        UserError: an ending that no format has.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 200, formats: Sequence[str] = ("ply",)) -> None:
         self.folder = Path(folder)
         self.every_n_steps = every_n_steps
-        self.formats = list(formats)
+        self.formats = [ending.lower().lstrip(".") for ending in formats]
+        writers = IO().mesh_interpreters
+        known = {suffix.lstrip(".") for each in writers for suffix in getattr(each, "known_suffixes", ())}
+        if unknown := ", ".join(sorted({*self.formats} - known)):
+            known_too = ", ".join(sorted(known))
+            raise UserError(f"callbacks.meshes.formats: no mesh format ends in {unknown}; known: {known_too}")
         self._batch: Any = None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
@@ -307,8 +316,6 @@ class MeshLogger(Callback):
         """Shows the end and writes the files."""
         if not _shows(trainer, pl_module, "meshes") or self._batch is None:
             return
-        from rendra.io import IO
-
         for name, meshes in self._show(trainer, pl_module).items():
             self.folder.mkdir(parents=True, exist_ok=True)
             for index in range(len(meshes)):

@@ -16,7 +16,15 @@ from torchmetrics import Metric
 
 from rendra_lab import losses, metrics
 from rendra_lab.base_task import BaseTask
-from rendra_lab.callbacks import AnimationWriter, ImageLogger, Progress, SequenceReport, StepTimer, StopWhenSettled
+from rendra_lab.callbacks import (
+    AnimationWriter,
+    ImageLogger,
+    MeshLogger,
+    Progress,
+    SequenceReport,
+    StepTimer,
+    StopWhenSettled,
+)
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import CsvTable, TensorBoard
 from rendra_lab.terms import LossTerm, MetricTerm
@@ -176,3 +184,9 @@ def test_the_clock_waits_for_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
         timer.on_train_batch_end(None, module, None, None, step)  # type: ignore[arg-type]
     assert waited[-2:] == [module.device] * 2
     assert timer.median_ms() is not None
+
+
+def test_mesh_files_in_unknown_formats_are_refused_before_the_fit(tmp_path: Path) -> None:
+    assert MeshLogger(str(tmp_path), formats=["PLY", ".glb"]).formats == ["ply", "glb"]
+    with pytest.raises(UserError, match="no mesh format ends in doc; known: glb"):
+        MeshLogger(str(tmp_path), formats=["ply", "doc"])
