@@ -99,7 +99,10 @@ NAMES = {
         TexturesAtlas TexturesUV TexturesVertex VolumeRenderer VolumeSampler camera_position_from_spherical_angles
         convert_to_tensors_and_broadcast diffuse get_world_to_view_transform gouraud_shading hard_rgb_blend
         look_at_rotation look_at_view_transform ndc_grid_sample ndc_to_grid_sample_coords phong_shading
-        rasterize_meshes rotate_on_spot sigmoid_alpha_blend softmax_rgb_blend specular""",
+        rasterize_meshes rotate_on_spot sigmoid_alpha_blend softmax_rgb_blend specular
+        AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher HarmonicEmbedding ImplicitRenderer
+        GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler NDCGridRaysampler
+        NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
     "rendra.renderer.blending": "BlendParams hard_rgb_blend sigmoid_alpha_blend softmax_rgb_blend",
     "rendra.renderer.camera_utils": "camera_to_eye_at_up join_cameras_as_batch rotate_on_spot",
     "rendra.renderer.cameras": """
@@ -107,6 +110,19 @@ NAMES = {
         camera_position_from_spherical_angles get_ndc_to_screen_transform get_screen_to_ndc_transform
         get_world_to_view_transform look_at_rotation look_at_view_transform try_get_projection_transform""",
     "rendra.renderer.fisheyecameras": "FishEyeCameras",
+    "rendra.ops.sample_pdf": "sample_pdf",
+    "rendra.renderer.implicit": """
+        AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher HarmonicEmbedding ImplicitRenderer VolumeRenderer
+        VolumeSampler GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler
+        NDCGridRaysampler NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
+    "rendra.renderer.implicit.harmonic_embedding": "HarmonicEmbedding",
+    "rendra.renderer.implicit.raymarching": "AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher",
+    "rendra.renderer.implicit.raysampling": """
+        GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler NDCGridRaysampler
+        NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
+    "rendra.renderer.implicit.sample_pdf": "sample_pdf sample_pdf_python",
+    "rendra.renderer.implicit.utils": """
+        HeterogeneousRayBundle RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
     "rendra.renderer.lighting": "AmbientLights DirectionalLights PointLights diffuse specular",
     "rendra.renderer.materials": "Materials",
     "rendra.renderer.splatter_blend": "SplatterBlender",
@@ -416,6 +432,46 @@ SIGNATURES = {
         "gouraud_shading": "meshes, fragments, lights, cameras, materials",
         "ndc_grid_sample": "input, grid_ndc, *, align_corners=False, **grid_sample_kwargs",
         "ndc_to_grid_sample_coords": "xy_ndc, image_size_hw",
+    },
+    "rendra.ops.sample_pdf": {"sample_pdf": "bins, weights, n_samples, det=False, eps=1e-5"},
+    "rendra.renderer.implicit.sample_pdf": {
+        "sample_pdf": "bins, weights, n_samples, det=False, eps=1e-5",
+        "sample_pdf_python": "bins, weights, N_samples, det=False, eps=1e-5",
+    },
+    "rendra.renderer.implicit.utils": {
+        "RayBundle": "origins, directions, lengths, xys",
+        "HeterogeneousRayBundle": "origins, directions, lengths, xys, camera_ids=None, camera_counts=None",
+        "ray_bundle_to_ray_points": "ray_bundle",
+        "ray_bundle_variables_to_ray_points": "rays_origins, rays_directions, rays_lengths",
+    },
+    "rendra.renderer.implicit.raysampling": {
+        "MultinomialRaysampler": """*, min_x, max_x, min_y, max_y, image_width, image_height, n_pts_per_ray,
+            min_depth, max_depth, n_rays_per_image=None, n_rays_total=None, unit_directions=False, stratified_sampling=False""",
+        "MultinomialRaysampler.forward": """self, cameras, *, mask=None, min_depth=None, max_depth=None,
+            n_rays_per_image=None, n_pts_per_ray=None, stratified_sampling=None, n_rays_total=None, **kwargs""",
+        "NDCMultinomialRaysampler": """*, image_width, image_height, n_pts_per_ray, min_depth, max_depth,
+            n_rays_per_image=None, n_rays_total=None, unit_directions=False, stratified_sampling=False""",
+        "MonteCarloRaysampler": """min_x, max_x, min_y, max_y, n_rays_per_image, n_pts_per_ray, min_depth, max_depth,
+            *, n_rays_total=None, unit_directions=False, stratified_sampling=False""",
+        "MonteCarloRaysampler.forward": "self, cameras, *, stratified_sampling=None, **kwargs",
+        "GridRaysampler": """min_x, max_x, min_y, max_y, image_width, image_height, n_pts_per_ray, min_depth,
+            max_depth""",
+        "NDCGridRaysampler": "image_width, image_height, n_pts_per_ray, min_depth, max_depth",
+    },
+    "rendra.renderer.implicit.raymarching": {
+        "EmissionAbsorptionRaymarcher": "surface_thickness=1",
+        "EmissionAbsorptionRaymarcher.forward": "self, rays_densities, rays_features, eps=1e-10, **kwargs",
+        "AbsorptionOnlyRaymarcher.forward": "self, rays_densities, **kwargs",
+    },
+    "rendra.renderer.implicit.renderer": {
+        "ImplicitRenderer": "raysampler, raymarcher",
+        "ImplicitRenderer.forward": "self, cameras, volumetric_function, **kwargs",
+    },
+    "rendra.renderer.implicit.harmonic_embedding": {
+        "HarmonicEmbedding": "n_harmonic_functions=6, omega_0=1.0, logspace=True, append_input=True",
+        "HarmonicEmbedding.forward": "self, x, diag_cov=None, **kwargs",
+        "HarmonicEmbedding.get_output_dim": "self, input_dims=3",
+        "HarmonicEmbedding.get_output_dim_static": "input_dims, n_harmonic_functions, append_input",
     },
     "rendra.renderer.camera_utils": {
         "camera_to_eye_at_up": "world_to_view_transform",

@@ -15,7 +15,7 @@ def sample_pdf(bins: Tensor, weights: Tensor, n_samples: int, det: bool = False,
         weights: (..., K) non-negative, of any sum.
         n_samples: how many to draw from each density.
         det: take the quantiles at n_samples even steps from 0 to 1, edges included, in place of random ones.
-        eps: added to all weights, so that those which sum to 0 are a density too, the uniform one.
+        eps: added to all weights, so that no bin is quite empty. Weights that are all 0 are the uniform density.
 
     Returns:
         (..., n_samples) in no order, or ascending if `det`. Differentiable with respect to both, the drawn
@@ -26,6 +26,7 @@ def sample_pdf(bins: Tensor, weights: Tensor, n_samples: int, det: bool = False,
     """
     _check(bins, weights, n_samples, eps)
     mass = weights + eps
+    mass = torch.where(mass.any(-1, keepdim=True), mass, 1.0)  # only without eps
     ends = mass.cumsum(-1)
     ends = ends / ends[..., -1:]  # (..., K) the distribution function at the upper edges
     starts = torch.cat((torch.zeros_like(ends[..., :1]), ends[..., :-1]), dim=-1)
@@ -34,7 +35,7 @@ def sample_pdf(bins: Tensor, weights: Tensor, n_samples: int, det: bool = False,
     k = torch.searchsorted(ends[..., :-1].detach().contiguous(), u, right=True)
     lower, upper = bins[..., :-1].gather(-1, k), bins[..., 1:].gather(-1, k)
     start, end = starts.gather(-1, k), ends.gather(-1, k)
-    height = torch.where(end > start, end - start, 1.0)  # 0 only if all weights and eps are
+    height = torch.where(end > start, end - start, 1.0)  # 0 where a quantile meets an empty bin
     return lower + ((u - start) / height).clamp(0.0, 1.0) * (upper - lower)
 
 
