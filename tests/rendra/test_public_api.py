@@ -114,7 +114,8 @@ NAMES = {
     "rendra.renderer.implicit": """
         AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher HarmonicEmbedding ImplicitRenderer VolumeRenderer
         VolumeSampler GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler
-        NDCGridRaysampler NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
+        NDCGridRaysampler NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points
+        ray_bundle_variables_to_ray_points""",
     "rendra.renderer.implicit.harmonic_embedding": "HarmonicEmbedding",
     "rendra.renderer.implicit.raymarching": "AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher",
     "rendra.renderer.implicit.raysampling": """
@@ -446,7 +447,8 @@ SIGNATURES = {
     },
     "rendra.renderer.implicit.raysampling": {
         "MultinomialRaysampler": """*, min_x, max_x, min_y, max_y, image_width, image_height, n_pts_per_ray,
-            min_depth, max_depth, n_rays_per_image=None, n_rays_total=None, unit_directions=False, stratified_sampling=False""",
+            min_depth, max_depth, n_rays_per_image=None, n_rays_total=None, unit_directions=False,
+            stratified_sampling=False""",
         "MultinomialRaysampler.forward": """self, cameras, *, mask=None, min_depth=None, max_depth=None,
             n_rays_per_image=None, n_pts_per_ray=None, stratified_sampling=None, n_rays_total=None, **kwargs""",
         "NDCMultinomialRaysampler": """*, image_width, image_height, n_pts_per_ray, min_depth, max_depth,

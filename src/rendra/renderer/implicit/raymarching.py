@@ -48,7 +48,7 @@ class EmissionAbsorptionRaymarcher(nn.Module):
         densities = _opacities(rays_densities)
         _check_features(rays_features, densities)
         weights = densities * _transmittance(1.0 + eps - densities, self.surface_thickness)
-        features = (weights[..., None, :] @ rays_features.to(weights.dtype))[..., 0, :]
+        features = (weights[..., None] * rays_features).sum(-2)
         return torch.cat((features, _opacity(densities)), dim=-1)
 
 
