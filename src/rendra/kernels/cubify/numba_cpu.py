@@ -153,11 +153,19 @@ def _fill(occupied, used, first_vert, first_quad, first_of_grid, planes, workers
                         left &= left - 1
                         _number_corners(flat, first_vert, entry, width * words, words, bit, first, corners)
                         voxel = ((grid * depth + m * _BITS + bit) * (height - 1) + j) * (width - 1) + i
-                        for side in range(6):
-                            if (sides[side] >> bit) & 1:
-                                _join(corners, side, quad, faces)
-                                voxel_of_quad[quad] = voxel
-                                quad += 1
+                        bare = _sides_at(sides, bit)
+                        while bare != 0:
+                            _join(corners, _ones((bare & -bare) - 1), quad, faces)
+                            bare &= bare - 1
+                            voxel_of_quad[quad] = voxel
+                            quad += 1
+
+
+@scalar_kernel
+def _sides_at(sides, bit):
+    """Which of one voxel's six sides are bare, as bits: without branches, which nothing could predict."""
+    low = ((sides[0] >> bit) & 1) | (((sides[1] >> bit) & 1) << 1) | (((sides[2] >> bit) & 1) << 2)
+    return low | (((sides[3] >> bit) & 1) << 3) | (((sides[4] >> bit) & 1) << 4) | (((sides[5] >> bit) & 1) << 5)
 
 
 @scalar_kernel
