@@ -103,7 +103,8 @@ def chamfer(prediction: Tensor, target: Tensor) -> Tensor:
 
 def cloud_to_surface(mesh: Meshes, points: Tensor) -> Tensor:
     """The mean squared distance of points (1, P, 3) from the surface of a batch of one mesh: a scalar."""
-    triangles = mesh.verts_packed()[mesh.faces_packed()]
+    # index_select: plain indexing adds up its gradient in parallel, in whatever order the threads come
+    triangles = mesh.verts_packed().index_select(0, mesh.faces_packed().reshape(-1)).view(-1, 3, 3)
     first = torch.zeros(1, dtype=torch.long, device=points.device)
     return point_face_distance(points[0], first, triangles, first, points.shape[1], 0.0).mean()
 
@@ -163,7 +164,8 @@ class SheetSeparation:
             gap, which = away.masked_fill(same_sheet, torch.inf).min(1)
             close = (gap < self.distance).nonzero()[:, 0]
             here, there = asked[close], near[close, which[close]]
-        gap = ((verts[here] - verts[there]) * normals[here]).sum(-1).abs()
+        across = verts.index_select(0, here) - verts.index_select(0, there)
+        gap = (across * normals[here]).sum(-1).abs()
         return (self.distance - gap).square().sum() / max(len(asked), 1)
 
 

@@ -9,6 +9,7 @@ from assertions import assert_close, assert_finite
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rendra.structures import Meshes
+from rendra.utils import ico_sphere
 from rendra_lab import losses, metrics
 
 
@@ -179,3 +180,13 @@ def test_a_surfaces_metrics_leave_the_random_state_alone() -> None:
     before = torch.get_rng_state()
     metrics.surface_chamfer(slab(0.5), cloud)
     assert torch.equal(before, torch.get_rng_state())
+
+
+def test_gradients_of_distances_are_the_same_every_time() -> None:
+    mesh, points = ico_sphere(5), 1.1 * torch.randn(1, 3000, 3)  # large enough for torch to use all threads
+    gradients = []
+    for _ in range(4):
+        verts = mesh.verts_packed().clone().requires_grad_()
+        losses.cloud_to_surface(mesh.update_padded(verts[None]), points).backward()
+        gradients.append(verts.grad)
+    assert all(torch.equal(gradients[0], other) for other in gradients[1:])
