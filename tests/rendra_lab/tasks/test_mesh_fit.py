@@ -11,6 +11,7 @@ from assertions import assert_close
 from torch import Tensor
 
 from rendra.io import IO
+from rendra.ops import self_intersections
 from rendra.structures import Meshes, Pointclouds
 from rendra.transforms import random_rotation
 from rendra.utils import ico_sphere
@@ -194,6 +195,21 @@ def test_a_torus_scan_is_met_and_restored(compose: Callable[..., Any], tmp_path:
         mesh = IO().load_mesh(folder / "exports" / f"surface.{ending}")
         assert_close(mesh.verts_packed().mean(0), points.mean(0), atol=2.0)
         assert len(mesh.faces_packed()) == 1280
+
+
+@pytest.mark.parametrize("steps", [9, 10, 11])
+def test_what_is_written_has_been_checked(steps: int, compose: Callable[..., Any], tmp_path: Path) -> None:
+    # wild steps, checked every 1,000: only the check after the last one can hold them back
+    wild = (
+        "optimizer.lr=3",
+        "module.check_every=1000",
+        "surface.levels=[3]",
+        "module.refine_at=[]",
+        "loss=[chamfer]",
+    )
+    folder = tmp_path / "mesh_fit" / "run"
+    fitted(compose, folder, "task=mesh_fit", "data.name=torus", f"trainer.max_steps={steps}", *wild)
+    assert len(self_intersections(IO().load_mesh(folder / "exports" / "surface.ply"))) == 0
 
 
 @pytest.mark.slow

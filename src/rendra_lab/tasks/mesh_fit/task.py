@@ -87,13 +87,11 @@ class MeshFit(Task[CloudBatch, SurfacePrediction]):
         super().on_train_batch_start(batch, batch_idx)
 
     def on_train_batch_end(self, outputs: Any, batch: CloudBatch, batch_idx: int) -> None:
-        """Lightning's hook: takes back, now and then, what made the surface cross itself."""
-        if self.global_step % self.check_every == 0:
+        """Lightning's hook: takes back, now and then and after the last step, what made the surface cross itself."""
+        # not in on_train_end: by then callbacks have written checkpoint and meshes
+        is_last = self.trainer.should_stop or self.global_step == self.trainer.max_steps
+        if is_last or self.global_step % self.check_every == 0:
             self.surface.check()
-
-    def on_train_end(self) -> None:
-        """Lightning's hook: the same for the last steps."""
-        self.surface.check()
 
     def panels(self, prediction: SurfacePrediction, batch: CloudBatch) -> dict[str, Tensor]:
         """The cloud and the surface, from the front and from the side."""
