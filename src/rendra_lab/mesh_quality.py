@@ -16,6 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from rendra.ops import knn_points
 from rendra.structures.meshes import Meshes
 
 _FLAT = 1e-6  # a face whose height is this small beside its longest side has no area
@@ -101,6 +102,14 @@ def duplicate_verts(mesh: Meshes) -> Tensor:
 def repeated_points(points: Tensor) -> Tensor:
     """Which of (P, D) points lie exactly where an earlier one lies; NaN is equal to nothing. (P,) bool"""
     return _repeats(points + 0.0) & ~points.isnan().any(1)  # -0.0 is 0.0
+
+
+@torch.no_grad()
+def nearest_distances(points: Tensor) -> Tensor:
+    """The distance of each of (P, 3) points from the nearest other one. (P,), none for fewer than two points"""
+    if len(points) < 2:
+        return points.new_zeros(0)
+    return knn_points(points[None], points[None], K=2).dists[0, :, 1].sqrt()
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rendra.ops import knn_points, self_intersections
+from rendra.ops import self_intersections
 from rendra.renderer.mesh.textures import TexturesAtlas, TexturesVertex
 from rendra.structures import Meshes
 from rendra_lab import mesh_quality as quality
@@ -382,7 +382,7 @@ def _report_cloud(asset: Asset) -> CloudReport:
     points, normals, features = asset.cloud.get_cloud(0)
     finite = points.isfinite().all(1)
     repeated = quality.repeated_points(points) & finite
-    spacing = nearest_distances(points[finite & ~repeated])
+    spacing = quality.nearest_distances(points[finite & ~repeated])
     off_unit = torch.zeros(0) if normals is None else (normals.norm(dim=1) - 1).abs()
     numbers: dict[str, Any] = {
         "duplicate_points": int(repeated.sum()),
@@ -412,13 +412,6 @@ def _report_cloud(asset: Asset) -> CloudReport:
         verdict=f"{_count(len(points), 'point')}{'; faults: ' + ', '.join(faults) if faults else ', in order'}",
         **numbers,
     )
-
-
-def nearest_distances(points: Tensor) -> Tensor:
-    """The distance of each of (P, 3) points from the nearest other one. (P,), none for fewer than two points"""
-    if len(points) < 2:
-        return points.new_zeros(0)
-    return knn_points(points[None], points[None], K=2).dists[0, :, 1].sqrt()
 
 
 def as_json(report: MeshReport | CloudReport) -> str:

@@ -17,7 +17,8 @@ from rendra.structures import Meshes, Pointclouds
 from rendra.vis import texturesuv_islands_image
 from rendra_lab.data.meshes import bounding_sphere, load_mesh
 from rendra_lab.mesh_asset import Asset, Material
-from rendra_lab.mesh_report import Findings, nearest_distances
+from rendra_lab.mesh_quality import nearest_distances
+from rendra_lab.mesh_report import Findings
 from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio, point_marks
 from rendra_lab.visualization import Picture, caption, tile, to_picture
 

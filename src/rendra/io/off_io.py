@@ -9,40 +9,19 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rendra.common.datatypes import Device
 from rendra.io._bulk_text import Block, Lines, Positions, fan_triangles, ragged_ranges
+from rendra.io._mesh_data import Floats, MeshData
 from rendra.io._rows import check_decimals, float_rows, format_rows, int_rows, single_rows
 from rendra.io._source import FileLike, PathManager, Source, read_source, write_sink
 from rendra.io.pluggable_formats import MeshFormatInterpreter, endswith, single_mesh
-from rendra.renderer.mesh.textures import TexturesAtlas, TexturesBase, TexturesVertex
+from rendra.renderer.mesh.textures import TexturesAtlas, TexturesVertex
 from rendra.structures import Meshes
-
-Floats = np.ndarray  # (n, 3) float32
 
 _KEYWORD = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF(.*)", re.DOTALL)
 _COUNTS = re.compile(r"[0-9]{1,18}")
-
-
-@dataclass(frozen=True)
-class OffData:
-    """What an OFF file says, polygons already cut into triangles; None where it says nothing.
-
-    Attributes:
-        verts: (V, 3).
-        faces: (F, 3) indices from 0.
-        normals: (V, 3).
-        verts_colors: (V, 3) in [0, 1].
-        faces_colors: (F, 3) in [0, 1]; white for a face without.
-    """
-
-    verts: Floats
-    faces: Positions
-    normals: Floats | None
-    verts_colors: Floats | None
-    faces_colors: Floats | None
 
 
 @dataclass(frozen=True)
@@ -63,7 +42,7 @@ class _Header:
     row: int
 
 
-def parse_off(source: Source) -> OffData:
+def parse_off(source: Source) -> MeshData:
     """Read the bytes of an OFF file.
 
     Raises:
@@ -83,7 +62,7 @@ def parse_off(source: Source) -> OffData:
         warnings.warn(f"{source.name}: line {lost} and what follows is neither vertex nor face", stacklevel=4)
     verts, normals, colors = _read_verts(lines.block(body[: header.num_verts]), header)
     faces, faces_colors = _read_faces(lines.block(body[header.num_verts : wanted]), header.num_verts)
-    return OffData(verts, faces, normals, colors, faces_colors)
+    return MeshData(verts, faces, normals, colors, faces_colors)
 
 
 def _read_header(lines: Lines, rows: Positions) -> tuple[_Header, Positions]:
@@ -212,18 +191,7 @@ class MeshOffFormat(MeshFormatInterpreter):
         """
         if not endswith(path, self.known_suffixes):
             return None
-        data = parse_off(read_source(path, path_manager))
-
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-
-        textures: TexturesBase | None = None
-        if include_textures and data.verts_colors is not None:
-            textures = TexturesVertex(verts_features=[tensor(data.verts_colors)])
-        elif include_textures and data.faces_colors is not None:
-            textures = TexturesAtlas(atlas=[tensor(data.faces_colors)[:, None, None]])
-        normals = None if data.normals is None else [tensor(data.normals)]
-        return Meshes([tensor(data.verts)], [tensor(data.faces)], textures, verts_normals=normals)
+        return parse_off(read_source(path, path_manager)).meshes(include_textures, device)
 
     def save(
         self,

@@ -5,16 +5,15 @@ Letters: V verts, F faces (triangles). Vertices that are not finite in single pr
 
 import sys
 import warnings
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from rendra.common.datatypes import Device
 from rendra.io._bulk_text import Positions, fan_triangles
+from rendra.io._mesh_data import Floats, MeshData
 from rendra.io._ply_body import Lists, Table, read_tables
 from rendra.io._ply_header import parse_header
 from rendra.io._rows import check_decimals, float_rows, format_rows, int_rows, number_format
@@ -27,31 +26,10 @@ from rendra.io.pluggable_formats import (
     single_cloud,
     single_mesh,
 )
-from rendra.renderer.mesh.textures import TexturesAtlas, TexturesBase, TexturesVertex
+from rendra.renderer.mesh.textures import TexturesBase, TexturesVertex
 from rendra.structures import Meshes, Pointclouds
 
-Floats = npt.NDArray[np.float32]
-
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-
-
-@dataclass(frozen=True)
-class PlyData:
-    """What a PLY file says about a mesh, polygons already cut into triangles; None where it says nothing.
-
-    Attributes:
-        verts: (V, 3).
-        faces: (F, 3) indices from 0; none in a file without faces.
-        normals: (V, 3), of the vertices.
-        verts_colors: (V, 3); integer colours scaled to [0, 1], others as they are.
-        faces_colors: (F, 3) likewise.
-    """
-
-    verts: Floats
-    faces: Positions
-    normals: Floats | None
-    verts_colors: Floats | None
-    faces_colors: Floats | None
 
 
 def load_ply(f: FileLike, *, path_manager: PathManager | None = None) -> tuple[Tensor, Tensor]:
@@ -75,7 +53,7 @@ def load_ply(f: FileLike, *, path_manager: PathManager | None = None) -> tuple[T
     return torch.from_numpy(data.verts), torch.from_numpy(data.faces)
 
 
-def parse_ply(source: Source) -> PlyData:
+def parse_ply(source: Source) -> MeshData:
     """Read the bytes of a PLY file; errors as in `load_ply`."""
     tables = read_tables(source, parse_header(source))
     if "vertex" not in tables:
@@ -91,10 +69,10 @@ def parse_ply(source: Source) -> PlyData:
         line = tables["tristrips"].element.line
         raise MeshFormatError("triangle strips are not supported", source.name, line, expected="element face")
     if face is None or not face.element.count:
-        return PlyData(verts, np.zeros((0, 3), dtype=np.int64), normals, colors, None)
+        return MeshData(verts, np.zeros((0, 3), dtype=np.int64), normals, colors, None)
     faces, polygons = _triangles(face, len(verts))
     faces_colors = _colors(face)
-    return PlyData(verts, faces, normals, colors, None if faces_colors is None else faces_colors[polygons])
+    return MeshData(verts, faces, normals, colors, None if faces_colors is None else faces_colors[polygons])
 
 
 def _vectors(table: Table, *names: str) -> Floats | None:
@@ -258,18 +236,7 @@ class MeshPlyFormat(MeshFormatInterpreter):
         """
         if not endswith(path, self.known_suffixes):
             return None
-        data = parse_ply(read_source(path, path_manager))
-
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array).to(device)
-
-        textures: TexturesBase | None = None
-        if include_textures and data.verts_colors is not None:
-            textures = TexturesVertex(verts_features=[tensor(data.verts_colors)])
-        elif include_textures and data.faces_colors is not None:
-            textures = TexturesAtlas(atlas=[tensor(data.faces_colors)[:, None, None]])
-        normals = None if data.normals is None else [tensor(data.normals)]
-        return Meshes([tensor(data.verts)], [tensor(data.faces)], textures, verts_normals=normals)
+        return parse_ply(read_source(path, path_manager)).meshes(include_textures, device)
 
     def save(
         self,

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from rendra.io import IO
 from rendra.io.errors import MeshFormatError
-from rendra.ops import knn_points, sample_points_from_meshes
+from rendra.ops import sample_points_from_meshes
 from rendra.structures import Meshes, Pointclouds
 from rendra_lab.data.meshes import load_mesh
 from rendra_lab.data.repeated import Repeated
 from rendra_lab.errors import UserError
+from rendra_lab.mesh_quality import nearest_distances
 from rendra_lab.records import TensorRecord
 
 log = logging.getLogger(__name__)
@@ -44,8 +45,8 @@ class CloudBatch(TensorRecord):
         scan = (scan - centre) / scale
         chosen = torch.randperm(len(scan), generator=generator)[:most].sort().values
         points = scan[chosen]
-        near = knn_points(points[None], points[None], K=2).dists[0, :, 1]
-        return CloudBatch(points[None], scan[None], near.median().sqrt()[None], centre[None], scale[None])
+        spacing = nearest_distances(points).median()
+        return CloudBatch(points[None], scan[None], spacing[None], centre[None], scale[None])
 
     def restored(self, mesh: Meshes) -> Meshes:
         """A mesh of the normalised frame at the file's place and in its units."""
