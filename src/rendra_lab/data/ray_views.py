@@ -1,0 +1,281 @@
+"""Pixels and their rays: what a radiance field is trained on and judged by.
+
+Letters: K rays of a pixel; "pixels" are R chosen ones in training, and (1, H, W) where a whole view is shown.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+
+from rendra.structures import Meshes
+from rendra_lab.data.posed_images import PosedImages
+from rendra_lab.errors import UserError
+from rendra_lab.records import TensorRecord
+
+BACKGROUNDS = {"white": 1.0, "black": 0.0, "random": None}
+
+
+@dataclass(frozen=True)
+class RayBatch(TensorRecord):
+    """What pixels show, and the rays that see it."""
+
+    rgb: Float[Tensor, "*pixels 3"]  # sRGB in [0, 1], laid over the background
+    mask: Float[Tensor, "*pixels"]  # coverage in [0, 1]; 1 in images without alpha
+    background: Float[Tensor, "*pixels 3"]  # what is behind everything, sRGB in [0, 1]
+    origins: Float[Tensor, "*pixels K 3"]  # in the world
+    directions: Float[Tensor, "*pixels K 3"]  # of length 1
+    nearest: Float[Tensor, "*pixels K"]  # distance along the ray at which the scene begins
+    farthest: Float[Tensor, "*pixels K"]  # and ends; not beyond `nearest` where the ray misses it
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Posed images of one scene, divided, and where the scene lies."""
+
+    train: PosedImages
+    val: PosedImages
+    test: PosedImages
+    box: Float[Tensor, "2 3"]  # lowest and highest corner of what may hold anything, in the world
+    depth_range: tuple[float, float] | None = None  # distances along a ray to look between; None: all of the box
+    truth: Meshes | None = None  # the scene itself, where it is known
+    up: tuple[float, float, float] | None = None  # the upward direction, where it is known
+
+
+def within_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave a box, not behind their origins: distances (...), equal where they miss it."""
+    tiny = torch.where(directions < 0, -1e-12, 1e-12).to(directions.dtype)
+    inverse = 1 / torch.where(directions.abs() < 1e-12, tiny, directions)
+    walls = (box[:, None] - origins.reshape(1, -1, 3)) * inverse.reshape(1, -1, 3)
+    enter = walls.amin(0).amax(-1).clamp_min(0).reshape(origins.shape[:-1])
+    leave = walls.amax(0).amin(-1).reshape(origins.shape[:-1])
+    return enter, torch.maximum(enter, leave)
+
+
+class RayCaster:
+    """Makes ray batches of the pixels of posed images.
+
+    Args:
+        box: (2, 3), see `Scene`.
+        depth_range: see `Scene`.
+        background: white, black or random.
+        side: rays of a pixel along each of its sides; K = side * side, spread evenly over its area.
+    """
+
+    def __init__(
+        self, box: Tensor, depth_range: tuple[float, float] | None, background: str = "white", side: int = 1
+    ) -> None:
+        self.box = box
+        self.depth_range = depth_range
+        self.background = background
+        self.side = side
+
+    def pixels(
+        self, images: PosedImages, chosen: Tensor, generator: torch.Generator | None = None, jitter: bool = False
+    ) -> RayBatch:
+        """Chosen pixels (R,), counted through all images.
+
+        Args:
+            images: to look at.
+            chosen: (R,) int64.
+            generator: of random backgrounds and jitter; None uses grey instead of random backgrounds.
+            jitter: move each ray to a random place of its part of the pixel.
+        """
+        view = torch.searchsorted(images.first_pixel, chosen, right=True) - 1
+        place = chosen - images.first_pixel[view]
+        width = images.sizes[view, 1]
+        corner = torch.stack([place % width, place // width], dim=-1).float()
+        offsets = self._offsets(len(chosen), generator if jitter else None)
+        xy = (corner[:, None] + offsets).reshape(-1, 2)
+        origins, directions = images.rays(view.repeat_interleave(self.side**2), xy)
+        rgba = images.pixels.index_select(0, chosen).float() / 255
+        behind = self._behind(len(chosen), generator)
+        return self._batch(rgba, behind, origins, directions)
+
+    def view(self, images: PosedImages, index: int) -> RayBatch:
+        """All pixels of one image: (1, H, W)."""
+        first, last = images.first_pixel[index : index + 2].tolist()
+        height, width = images.sizes[index].tolist()
+        flat = self.pixels(images, torch.arange(first, last))
+        return flat._map(
+            lambda value: value.reshape(1, height, width, *value.shape[1:]), lambda value: isinstance(value, Tensor)
+        )
+
+    def _offsets(self, count: int, generator: torch.Generator | None) -> Tensor:
+        """Where in its pixel each ray goes through: (count or 1, K, 2)."""
+        cells = torch.arange(self.side)
+        grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2).float()
+        if generator is None:
+            return (grid + 0.5) / self.side
+        return (grid + torch.rand(count, self.side**2, 2, generator=generator)) / self.side
+
+    def _behind(self, count: int, generator: torch.Generator | None) -> Tensor:
+        value = BACKGROUNDS[self.background]
+        if value is not None:
+            return torch.full((count, 3), value)
+        return torch.full((count, 3), 0.5) if generator is None else torch.rand(count, 3, generator=generator)
+
+    def _batch(self, rgba: Tensor, behind: Tensor, origins: Tensor, directions: Tensor) -> RayBatch:
+        origins, directions = (rays.reshape(len(rgba), -1, 3) for rays in (origins, directions))
+        nearest, farthest = within_box(origins, directions, self.box)
+        if self.depth_range is not None:
+            nearest, farthest = nearest.clamp_min(self.depth_range[0]), farthest.clamp_max(self.depth_range[1])
+        alpha = rgba[:, 3:]
+        rgb = rgba[:, :3] * alpha + behind * (1 - alpha)
+        return RayBatch(rgb, alpha[:, 0], behind, origins, directions, nearest, torch.maximum(nearest, farthest))
+
+
+class RandomPixels:
+    """Endless random pixels of the training images; one pass is one epoch of `steps` batches.
+
+    The random numbers of a step follow from seed and step alone, so a resumed run sees what it would have seen.
+    """
+
+    def __init__(
+        self, caster: RayCaster, images: PosedImages, pixels: int, steps: int, seed: int, **how: Any
+    ) -> None:
+        self.caster, self.images = caster, images
+        self.num_pixels, self.steps, self.seed = pixels, steps, seed
+        self.views_per_step: int | None = how["views_per_step"]
+        self.precrop: float = how["precrop"]
+        self.precrop_steps: int = how["precrop_steps"]
+        self.jitter: bool = how["jitter"]
+        self._next = 0
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __iter__(self) -> Iterator[RayBatch]:
+        while self._next < self.steps:
+            self._next += 1
+            yield self._batch(self._next - 1)
+        self._next = 0
+
+    def state_dict(self) -> dict[str, int]:
+        """How far the running epoch is; Lightning keeps it in checkpoints."""
+        return {"next": self._next}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Lets the next epoch be the rest of one that a checkpoint interrupted."""
+        self._next = state["next"] % self.steps
+
+    def _batch(self, step: int) -> RayBatch:
+        generator = torch.Generator().manual_seed((self.seed << 32) + step)
+        chosen = self._chosen(step, generator)
+        return self.caster.pixels(self.images, chosen, generator, self.jitter)
+
+    def _chosen(self, step: int, generator: torch.Generator) -> Tensor:
+        count = self.num_pixels
+        views = torch.arange(len(self.images))
+        if self.views_per_step is not None:
+            views = torch.randperm(len(views), generator=generator)[: self.views_per_step]
+        view = views[torch.randint(len(views), (count,), generator=generator)]
+        share = self.precrop if step < self.precrop_steps else 1.0
+        inside = (1 - share) / 2 + share * torch.rand(count, 2, generator=generator)
+        size = self.images.sizes[view]
+        row, column = (inside * size).long().minimum(size - 1).unbind(1)
+        return self.images.first_pixel[view] + row * size[:, 1] + column
+
+
+class WholeViews:
+    """Every pixel of every image, one image a batch."""
+
+    def __init__(self, caster: RayCaster, images: PosedImages) -> None:
+        self.caster, self.images = caster, images
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __iter__(self) -> Iterator[RayBatch]:
+        for index in range(len(self.images)):
+            yield self.caster.view(self.images, index)
+
+
+class SceneViews(LightningDataModule, ABC):
+    """Views of one scene; subclasses say where they come from.
+
+    Args:
+        pixels_per_step: pixels R that a training step sees.
+        rays_per_pixel_side: rays of a pixel along each of its sides; a pixel's colour is the mean of its rays.
+        background: white, black or random, behind what images leave transparent.
+        views_per_step: images that the pixels of a step come from; null takes all.
+        precrop: share of the sides of an image, about its middle, that the first steps see.
+        precrop_steps: how many steps those are.
+        jitter: move rays at random within their part of the pixel in training.
+        seed: of the choice of pixels.
+        steps: of an epoch.
+    """
+
+    def __init__(
+        self,
+        pixels_per_step: int = 4096,
+        rays_per_pixel_side: int = 1,
+        background: str = "white",
+        views_per_step: int | None = None,
+        precrop: float = 1.0,
+        precrop_steps: int = 0,
+        jitter: bool = False,
+        seed: int = 0,
+        steps: int = 100_000,
+    ) -> None:
+        super().__init__()
+        if background not in BACKGROUNDS:
+            raise UserError(f"data.background must be one of {', '.join(BACKGROUNDS)}, got {background!r}")
+        _at_least_one(
+            pixels_per_step=pixels_per_step,
+            rays_per_pixel_side=rays_per_pixel_side,
+            views_per_step=views_per_step,
+            steps=steps,
+        )
+        if not 0 < precrop <= 1:
+            raise UserError(f"data.precrop is a share of an image's sides, in (0, 1], got {precrop}")
+        self.pixels_per_step = pixels_per_step
+        self.rays_per_pixel_side = rays_per_pixel_side
+        self.background = background
+        self.seed = seed
+        self.steps = steps
+        self.how = {
+            "views_per_step": views_per_step,
+            "precrop": precrop,
+            "precrop_steps": precrop_steps,
+            "jitter": jitter,
+        }
+
+    @abstractmethod
+    def load(self) -> Scene:
+        """The views; UserError names the file and what is wrong with it."""
+
+    def setup(self, stage: str) -> None:
+        """Lightning's hook, before the fit and again before the test: loads the views, once."""
+        if not hasattr(self, "scene"):
+            self.scene = self.load()
+
+    @property
+    def caster(self) -> RayCaster:
+        """Makes the rays of this scene."""
+        return RayCaster(self.scene.box, self.scene.depth_range, self.background, self.rays_per_pixel_side)
+
+    def train_dataloader(self) -> RandomPixels:
+        """Random pixels of the training images."""
+        return RandomPixels(self.caster, self.scene.train, self.pixels_per_step, self.steps, self.seed, **self.how)
+
+    def val_dataloader(self) -> WholeViews | Sequence[RayBatch]:
+        """The validation images, one a batch."""
+        return WholeViews(self.caster, self.scene.val)
+
+    def test_dataloader(self) -> WholeViews:
+        """The test images, one a batch."""
+        return WholeViews(self.caster, self.scene.test)
+
+
+def _at_least_one(**numbers: int | None) -> None:
+    for name, number in numbers.items():
+        if number is not None and number < 1:
+            raise UserError(f"data.{name} must be at least 1, got {number}")
