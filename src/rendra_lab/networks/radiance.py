@@ -8,7 +8,43 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from rendra_lab.data.ray_views import RayBatch
 from rendra_lab.records import TensorRecord
+
+
+@dataclass(frozen=True)
+class Rays(TensorRecord):
+    """Q rays, and where on each to look."""
+
+    origins: Float[Tensor, "Q 3"]  # in the world
+    directions: Float[Tensor, "Q 3"]  # of length 1
+    nearest: Float[Tensor, " Q"]  # distance along the ray
+    farthest: Float[Tensor, " Q"]  # not beyond `nearest`: there is nothing on this ray
+
+    @classmethod
+    def of(cls, batch: RayBatch) -> Rays:
+        """All rays of a batch, those of a pixel side by side."""
+        return cls(
+            batch.origins.reshape(-1, 3),
+            batch.directions.reshape(-1, 3),
+            batch.nearest.reshape(-1),
+            batch.farthest.reshape(-1),
+        )
+
+    def slice(self, first: int, last: int) -> Rays:
+        """The rays first, ..., last - 1."""
+        return self._map(lambda value: value[first:last], lambda value: isinstance(value, Tensor))
+
+
+@dataclass(frozen=True)
+class RaysSeen(TensorRecord):
+    """What each of Q rays saw."""
+
+    rgb: Float[Tensor, "Q 3"]  # light, sRGB in [0, 1], with nothing behind it: not divided by the opacity
+    opacity: Float[Tensor, " Q"]  # one minus transmittance at the end of the ray
+    depth: Float[Tensor, " Q"]  # sum of distance times weight: not divided by the opacity
+    rgb_coarse: Float[Tensor, "Q 3"] | None = None  # of the first pass of hierarchical sampling
+    opacity_coarse: Float[Tensor, " Q"] | None = None
 
 
 @dataclass(frozen=True)
@@ -34,3 +70,27 @@ class RadianceScene(Protocol):
 
     def color_at(self, points: Float[Tensor, "M 3"], directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
         """The light, sRGB in [0, 1], that leaves the points against rays of such unit directions."""
+
+
+def mean_over_rays(seen: RaysSeen, batch: RayBatch) -> RadiancePrediction:
+    """What the pixels of a batch show: the mean of their rays, laid over the background."""
+    shape = batch.nearest.shape  # (*pixels, K)
+    opacity = seen.opacity.reshape(shape).mean(-1)
+    depth = seen.depth.reshape(shape).mean(-1) / opacity.clamp_min(1e-6)
+    coarse = None
+    if seen.rgb_coarse is not None and seen.opacity_coarse is not None:
+        coarse = _over_background(seen.rgb_coarse, seen.opacity_coarse.reshape(shape).mean(-1), batch)
+    return RadiancePrediction(_over_background(seen.rgb, opacity, batch), opacity, depth, coarse)
+
+
+def _over_background(rgb: Tensor, opacity: Tensor, batch: RayBatch) -> Tensor:
+    light = rgb.reshape(*batch.nearest.shape, 3).mean(-2)
+    return light + (1 - opacity)[..., None] * batch.background
+
+
+def view_panels(prediction: RadiancePrediction, batch: RayBatch) -> dict[str, Tensor]:
+    """A whole view, its rendering, and where they differ; nothing of a batch of single pixels."""
+    if batch.rgb.ndim != 4:
+        return {}
+    error = (prediction.rgb - batch.rgb).abs().mean(-1)
+    return {"target": batch.rgb, "rendering": prediction.rgb, "error x 4": (4 * error).clamp(max=1)[..., None]}
