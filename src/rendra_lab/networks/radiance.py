@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -45,6 +47,12 @@ class RaysSeen(TensorRecord):
     depth: Float[Tensor, " Q"]  # sum of distance times weight: not divided by the opacity
     rgb_coarse: Float[Tensor, "Q 3"] | None = None  # of the first pass of hierarchical sampling
     opacity_coarse: Float[Tensor, " Q"] | None = None
+
+    @classmethod
+    def join(cls, pieces: Sequence[RaysSeen]) -> RaysSeen:
+        """One record of the rays of several, in order."""
+        columns = {name: [getattr(piece, name) for piece in pieces] for name in cls.names()}
+        return cls(**{name: None if column[0] is None else torch.cat(column) for name, column in columns.items()})
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,99 @@
+"""Fields whose features are looked up in trainable grids, and read by small networks.
+
+Mueller et al., "Instant neural graphics primitives", SIGGRAPH 2022 (hash grids; Sec. 5.4 has the two networks);
+Fridovich-Keil et al., "K-Planes", CVPR 2023 (tri-planes).
+Shapes: M points.  Densities are per unit of length of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rendra_lab.tasks.nerf.fields import RadianceField
+
+_LARGEST_EXPONENT = 12.0  # exp(12) per unit of length is opaque at every step anybody takes
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp(x), cut off where it is opaque, with a gradient there that still can lower it."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = x.clamp(max=_LARGEST_EXPONENT).exp()
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        (y,) = ctx.saved_tensors
+        return gradients[0] * y
+
+
+class GridField(RadianceField):
+    """Density and light from the features that an encoding finds at a point.
+
+    The matter is a density: a sample of length s is opaque by 1 - exp(-density s).
+
+    Args:
+        encoding: points (M, 3) in the unit cube to features (M, `encoding.width`).
+        directions: unit vectors (M, 3) to features (M, `directions.width`); null: the light is the same all round.
+        width: of the hidden layers.
+        density_layers: hidden layers between the features and the density.
+        color_layers: hidden layers between the density's features and the light.
+        memory: features that the density network hands on to the light's, besides the encoding's own.
+        start_density: everywhere, before training, in units of 1 / (longest side of the box).
+    """
+
+    def __init__(
+        self,
+        encoding: nn.Module,
+        directions: nn.Module | None = None,
+        width: int = 64,
+        density_layers: int = 1,
+        color_layers: int = 2,
+        memory: int = 15,
+        start_density: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.encoding = encoding
+        self.directions = directions
+        self.start_density = start_density
+        self.density_net = perceptron([encoding.width, *[width] * density_layers, 1 + memory])
+        sees = 0 if directions is None else directions.width
+        self.color_net = perceptron([memory + sees, *[width] * color_layers, 3])
+
+    def forward(
+        self, points: Tensor, directions: Tensor, steps: Tensor, ray_index: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Opacities (M,) and light (M, 3) of samples; see `RadianceField`."""
+        features = self._features(points)
+        known = features[:, 1:]
+        if self.directions is not None:
+            seen = self.directions(directions)
+            known = torch.cat([known, seen if ray_index is None else seen.index_select(0, ray_index)], dim=1)
+        return self._alpha(features[:, 0], steps), self.color_net(known).sigmoid()
+
+    def opacity(self, points: Tensor, steps: Tensor) -> Tensor:
+        """Opacities (M,) of samples."""
+        return self._alpha(self._features(points)[:, 0], steps)
+
+    def _features(self, points: Tensor) -> Tensor:
+        low, high = self.box
+        return self.density_net(self.encoding((points - low) / (high - low)))
+
+    def _alpha(self, raw: Tensor, steps: Tensor) -> Tensor:
+        size = (self.box[1] - self.box[0]).amax()
+        density = _TruncatedExp.apply(raw) * (self.start_density / size)
+        return -torch.expm1(-density * steps)
+
+
+def perceptron(widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers of these widths with ReLU between them, without biases."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])

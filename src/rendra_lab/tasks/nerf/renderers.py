@@ -1,0 +1,50 @@
+"""What every renderer of a radiance field does: rays in, what they saw out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import nn
+
+from rendra_lab.data.ray_views import Scene
+from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.tasks.nerf.fields import RadianceField
+
+
+class RayRenderer(nn.Module, ABC):
+    """Asks a field about samples along rays. Subclasses say where the samples lie.
+
+    Args:
+        field: the field that is shown; the finer one where there are two.
+        rays_at_once: rays of a view that are rendered together when nothing is trained.
+    """
+
+    def __init__(self, field: RadianceField, rays_at_once: int = 8192) -> None:
+        super().__init__()
+        if rays_at_once < 1:
+            raise ValueError(f"sampler.rays_at_once must be at least 1, got {rays_at_once}")
+        self.field = field
+        self.rays_at_once = rays_at_once
+
+    @abstractmethod
+    def render(self, rays: Rays) -> RaysSeen:
+        """What rays see, all at once."""
+
+    def forward(self, rays: Rays) -> RaysSeen:
+        """What rays see; piece by piece, to bounded memory, where no gradient is wanted."""
+        if torch.is_grad_enabled():
+            return self.render(rays)
+        count = len(rays.nearest)
+        pieces = [
+            self.render(rays.slice(first, first + self.rays_at_once))
+            for first in range(0, max(count, 1), self.rays_at_once)
+        ]
+        return RaysSeen.join(pieces)
+
+    def place(self, scene: Scene) -> None:
+        """Say where the scene lies, before the first step."""
+        self.field.place(scene.box)
+
+    def refresh(self, step: int) -> None:  # noqa: B027
+        """Called before every training step: a renderer that remembers empty space looks again now and then."""

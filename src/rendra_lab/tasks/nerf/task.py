@@ -1,0 +1,62 @@
+"""NeRF: a radiance field fitted to posed images of one scene.
+
+Mildenhall et al., "NeRF", ECCV 2020, arXiv:2003.08934. Which field, and where along a ray it is asked, are parts that
+the task is handed; a pixel's colour is the mean over its rays.
+Shapes: as of `RayBatch`.  Units: distances in those of the scene, colour is sRGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from rendra_lab.base_task import Task
+from rendra_lab.data.ray_views import RayBatch, SceneViews
+from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, view_panels
+from rendra_lab.tasks.nerf.renderers import RayRenderer
+
+
+class NeRF(Task[RayBatch, RadiancePrediction]):
+    """Fit one field to one scene.
+
+    Args:
+        renderer: asks a field about rays.
+        **parts: losses, metrics, optimizer, scheduler of `Task`.
+    """
+
+    def __init__(self, renderer: RayRenderer, **parts: Any) -> None:
+        super().__init__(**parts)
+        self.renderer = renderer
+
+    def predict(self, batch: RayBatch) -> RadiancePrediction:
+        """What the rays of a batch see."""
+        return mean_over_rays(self.renderer(Rays.of(batch)), batch)
+
+    def on_fit_start(self) -> None:
+        """Lightning's hook: says where the scene lies, unless a checkpoint did."""
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        assert isinstance(data, SceneViews)
+        self.renderer.place(data.scene)
+
+    def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
+        """Lightning's hook: lets the renderer learn where there is nothing."""
+        self.renderer.refresh(self.global_step)
+        super().on_train_batch_start(batch, batch_idx)
+
+    def panels(self, prediction: RadiancePrediction, batch: RayBatch) -> dict[str, Tensor]:
+        """The view, its rendering, and where they differ."""
+        return view_panels(prediction, batch)
+
+    @property
+    def box(self) -> Tensor:
+        """See `RadianceScene`."""
+        return self.renderer.field.box
+
+    def opacity_at(self, points: Tensor, step: float) -> Tensor:
+        """See `RadianceScene`."""
+        return self.renderer.field.opacity(points, points.new_full((len(points),), step))
+
+    def color_at(self, points: Tensor, directions: Tensor) -> Tensor:
+        """See `RadianceScene`."""
+        return self.renderer.field(points, directions, points.new_ones(len(points)))[1]
