@@ -58,3 +58,23 @@ def check_raster(image_size: tuple[int, int], blur_radius: float) -> None:
 def neighbor_array(neighbor: Tensor | None, num_faces: int) -> np.ndarray:
     """The clipped halves' partners as kernels read them: (F,) int64, -1 where there is none."""
     return np.full(num_faces, -1) if neighbor is None else neighbor.contiguous().numpy()
+
+
+def check_ray_first(ray_first: Tensor, packed: Tensor) -> None:
+    """Indices (R + 1,) of the first of each ray's samples, and their number at the end, for packed (M, ...) samples.
+
+    The numbers themselves are checked on the CPU only.
+
+    Raises:
+        ValueError: saying what was given and what was expected.
+    """
+    if ray_first.ndim != 1 or not len(ray_first) or ray_first.dtype != torch.int64:
+        raise ValueError(
+            f"ray_first must be int64 of shape (R + 1,), got {ray_first.dtype} of {tuple(ray_first.shape)}"
+        )
+    if ray_first.device != packed.device:
+        raise ValueError(f"ray_first must be on {packed.device}, like the samples, got {ray_first.device}")
+    if ray_first.device.type != "cpu":
+        return
+    if ray_first[0] != 0 or ray_first[-1] != len(packed) or not bool((ray_first[1:] >= ray_first[:-1]).all()):
+        raise ValueError(f"ray_first must start at 0, never fall and end at the number of samples, {len(packed)}")
