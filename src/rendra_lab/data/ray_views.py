@@ -90,11 +90,7 @@ class RayCaster:
         """
         view = torch.searchsorted(images.first_pixel, chosen, right=True) - 1
         place = chosen - images.first_pixel[view]
-        width = images.sizes[view, 1]
-        corner = torch.stack([place % width, place // width], dim=-1).float()
-        offsets = self._offsets(len(chosen), generator if jitter else None)
-        xy = (corner[:, None] + offsets).reshape(-1, 2)
-        origins, directions = images.rays(view.repeat_interleave(self.side**2), xy)
+        origins, directions = self._rays(images, view, place, generator if jitter else None)
         rgba = images.pixels.index_select(0, chosen).float() / 255
         behind = self._behind(len(chosen), generator)
         return self._batch(rgba, behind, origins, directions)
@@ -102,11 +98,23 @@ class RayCaster:
     def view(self, images: PosedImages, index: int) -> RayBatch:
         """All pixels of one image: (1, H, W)."""
         first, last = images.first_pixel[index : index + 2].tolist()
-        height, width = images.sizes[index].tolist()
-        flat = self.pixels(images, torch.arange(first, last))
-        return flat._map(
-            lambda value: value.reshape(1, height, width, *value.shape[1:]), lambda value: isinstance(value, Tensor)
-        )
+        return _as_view(self.pixels(images, torch.arange(first, last)), images, index)
+
+    def blank_view(self, cameras: PosedImages, index: int) -> RayBatch:
+        """All pixels of a camera that took no image, (1, H, W): nothing but background before its rays."""
+        place = torch.arange(int(cameras.sizes[index].prod()))
+        origins, directions = self._rays(cameras, torch.full_like(place, index), place, None)
+        flat = self._batch(torch.zeros(len(place), 4), self._behind(len(place), None), origins, directions)
+        return _as_view(flat, cameras, index)
+
+    def _rays(
+        self, images: PosedImages, view: Tensor, place: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Origins and directions (R * K, 3) through pixels, each counted row by row within its image."""
+        width = images.sizes[view, 1]
+        corner = torch.stack([place % width, place // width], dim=-1).float()
+        xy = (corner[:, None] + self._offsets(len(place), generator)).reshape(-1, 2)
+        return images.rays(view.repeat_interleave(self.side**2), xy)
 
     def _offsets(self, count: int, generator: torch.Generator | None) -> Tensor:
         """Where in its pixel each ray goes through: (count or 1, K, 2)."""
@@ -130,6 +138,14 @@ class RayCaster:
         alpha = rgba[:, 3:]
         rgb = rgba[:, :3] * alpha + behind * (1 - alpha)
         return RayBatch(rgb, alpha[:, 0], behind, origins, directions, nearest, torch.maximum(nearest, farthest))
+
+
+def _as_view(flat: RayBatch, images: PosedImages, index: int) -> RayBatch:
+    """The pixels of one image (H * W, ...) as (1, H, W, ...)."""
+    height, width = images.sizes[index].tolist()
+    return flat._map(
+        lambda value: value.reshape(1, height, width, *value.shape[1:]), lambda value: isinstance(value, Tensor)
+    )
 
 
 class RandomPixels:
