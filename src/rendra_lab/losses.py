@@ -74,6 +74,12 @@ def huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, delta:
     return _mean(near * (size - 0.5 * near), mask)
 
 
+def pseudo_huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, scale: float = 0.1) -> Tensor:
+    """The mean of s (sqrt(1 + d^2 / s^2) - 1), d = prediction - target: d^2 / 2s near 0, |d| - s far from it."""
+    squared = (prediction - target).square() / scale**2
+    return _mean(scale * ((1 + squared).sqrt() - 1), mask)
+
+
 def silhouette_iou(prediction: Tensor, target: Tensor) -> Tensor:
     """One minus the soft intersection over union of two coverages in [0, 1], averaged over the batch.
 

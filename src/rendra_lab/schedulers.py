@@ -36,3 +36,20 @@ def exponential(optimizer: Optimizer, total_steps: int, final_factor: float = 0.
 def piecewise(optimizer: Optimizer, knots: Sequence[Sequence[float]]) -> LambdaLR:
     """The rate times a factor that follows straight lines between knots (step, factor): `PiecewiseLinear`."""
     return LambdaLR(optimizer, PiecewiseLinear(knots))
+
+
+def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, factor: float = 0.1) -> LambdaLR:
+    """After a share `at` of the run the rate is `factor` times what it was, and the optimizer starts anew.
+
+    As if another optimizer took over: Adam's running means are forgotten.
+    """
+    if not 0 <= at <= 1:
+        raise ValueError(f"at is a share of the run, in [0, 1], got {at}")
+    restart = round(at * total_steps)
+
+    def rate(step: int) -> float:
+        if step == restart:
+            optimizer.state.clear()
+        return factor if step >= restart else 1.0
+
+    return LambdaLR(optimizer, rate)
