@@ -77,7 +77,7 @@ def huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, delta:
 def pseudo_huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, scale: float = 0.1) -> Tensor:
     """The mean of s (sqrt(1 + d^2 / s^2) - 1), d = prediction - target: d^2 / 2s near 0, |d| - s far from it."""
     squared = (prediction - target).square() / scale**2
-    return _mean(scale * ((1 + squared).sqrt() - 1), mask)
+    return _mean(scale * squared / (1 + (1 + squared).sqrt()), mask)
 
 
 def silhouette_iou(prediction: Tensor, target: Tensor) -> Tensor:

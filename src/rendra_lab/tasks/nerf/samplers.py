@@ -6,6 +6,7 @@ Letters: Q rays, S samples along each.  Distances are world units along the ray.
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -100,7 +101,7 @@ class StratifiedRenderer(DenseRenderer):
         **marching: see `DenseRenderer`.
     """
 
-    def __init__(self, field: RadianceField, samples: int = 128, **marching: bool | int) -> None:
+    def __init__(self, field: RadianceField, samples: int = 128, **marching: Any) -> None:
         super().__init__(field, **marching)
         _at_least(2, samples=samples)
         self.samples = samples
@@ -127,7 +128,7 @@ class HierarchicalRenderer(DenseRenderer):
         coarse: RadianceField,
         coarse_samples: int = 64,
         fine_samples: int = 128,
-        **marching: bool | int,
+        **marching: Any,
     ) -> None:
         super().__init__(field, **marching)
         _at_least(3, coarse_samples=coarse_samples)
