@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -52,7 +52,10 @@ class RaysSeen(TensorRecord):
     def join(cls, pieces: Sequence[RaysSeen]) -> RaysSeen:
         """One record of the rays of several, in order."""
         columns = {name: [getattr(piece, name) for piece in pieces] for name in cls.names()}
-        return cls(**{name: None if column[0] is None else torch.cat(column) for name, column in columns.items()})
+        joined: dict[str, Any] = {
+            name: None if column[0] is None else torch.cat(column) for name, column in columns.items()
+        }
+        return cls(**joined)
 
 
 @dataclass(frozen=True)

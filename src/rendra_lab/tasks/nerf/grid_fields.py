@@ -7,8 +7,9 @@ Shapes: M points.  Densities are per unit of length of the world.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +34,15 @@ class _TruncatedExp(torch.autograd.Function):
         return gradients[0] * y
 
 
+class Encoding(Protocol):
+    """Turns points or directions (M, 3) into features (M, width)."""
+
+    width: int
+
+    def __call__(self, points: Tensor, /) -> Tensor:
+        """Features (M, width)."""
+
+
 class GridField(RadianceField):
     """Density and light from the features that an encoding finds at a point.
 
@@ -50,8 +60,8 @@ class GridField(RadianceField):
 
     def __init__(
         self,
-        encoding: nn.Module,
-        directions: nn.Module | None = None,
+        encoding: Encoding,
+        directions: Encoding | None = None,
         width: int = 64,
         density_layers: int = 1,
         color_layers: int = 2,
@@ -59,8 +69,8 @@ class GridField(RadianceField):
         start_density: float = 1.0,
     ) -> None:
         super().__init__()
-        self.encoding = encoding
-        self.directions = directions
+        self.encoding: Encoding = encoding
+        self.directions: Encoding | None = directions
         self.start_density = start_density
         self.density_net = perceptron([encoding.width, *[width] * density_layers, 1 + memory])
         sees = 0 if directions is None else directions.width
@@ -94,6 +104,6 @@ class GridField(RadianceField):
 def perceptron(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers of these widths with ReLU between them, without biases."""
     layers: list[nn.Module] = []
-    for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+    for inputs, outputs in itertools.pairwise(widths):
         layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU()]
     return nn.Sequential(*layers[:-1])

@@ -46,5 +46,5 @@ class RayRenderer(nn.Module, ABC):
         """Say where the scene lies, before the first step."""
         self.field.place(scene.box)
 
-    def refresh(self, step: int) -> None:  # noqa: B027
+    def refresh(self, step: int) -> None:
         """Called before every training step: a renderer that remembers empty space looks again now and then."""
