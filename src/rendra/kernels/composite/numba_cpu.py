@@ -126,56 +126,79 @@ def _transmit(values, deltas, by_density, stop, first, end, clears):
 
 
 @scalar_kernel
-def _worth(features, m, grad_out, r):
-    """How much the loss grows with the weight of sample m, by its features; they get no gradient here."""
+def _worths(features, positions, grad_out, grad_opacity, grad_depth, grad_weights, r, first, end, worths):
+    """How much the loss grows with the weight of each sample [first, end) of ray r."""
     if features.shape[1] == 3:
-        return features[m, 0] * grad_out[r, 0] + features[m, 1] * grad_out[r, 1] + features[m, 2] * grad_out[r, 2]
-    total = ZERO
-    for c in range(features.shape[1]):
-        total += features[m, c] * grad_out[r, c]
-    return total
+        red, green, blue = grad_out[r, 0], grad_out[r, 1], grad_out[r, 2]
+        for m in range(first, end):
+            worths[m - first] = red * features[m, 0] + green * features[m, 1] + blue * features[m, 2]
+    else:
+        for m in range(first, end):
+            total = ZERO
+            for c in range(features.shape[1]):
+                total += features[m, c] * grad_out[r, c]
+            worths[m - first] = total
+    for m in range(first, end):
+        worths[m - first] += grad_opacity[r] + grad_depth[r] * positions[m]
+    if len(grad_weights):
+        for m in range(first, end):
+            worths[m - first] += grad_weights[m]
 
 
 @scalar_kernel
-def _differentiate_ray(samples, by_density, first, end, r, upstream, grads):
-    """Samples [first, end) of ray r from the last to the first; grad_values holds their transmittance."""
-    values, deltas, features, positions = samples
-    grad_out, grad_opacity, grad_depth, grad_weights = upstream
-    grad_values, grad_deltas, _, _ = grads
+def _slopes_of_alphas(alphas, first, end, worths, grads):
+    """From the last sample to the first; `grads` holds their transmittance and gets their gradients."""
     behind = ZERO
-    for i in range(end - first):
-        m = end - 1 - i
-        worth = _worth(features, m, grad_out, r) + grad_opacity[r] + grad_depth[r] * positions[m]
-        if len(grad_weights):
-            worth += grad_weights[m]
-        slope = grad_values[m] * (worth - behind)
-        alpha = values[m]
-        if by_density:
-            alpha = opacity_of(values[m] * deltas[m])
-            if len(grad_deltas):
-                grad_deltas[m] = slope * values[m]
-            slope *= deltas[m]
-        grad_values[m] = slope
-        behind = worth * alpha + (ONE - alpha) * behind
+    for m in range(end - 1, first - 1, -1):
+        worth = worths[m - first]
+        grads[m] *= worth - behind
+        behind += alphas[m] * (worth - behind)
+
+
+@scalar_kernel
+def _slopes_of_densities(densities, deltas, first, end, worths, grads, grad_deltas):
+    """The same; `grads` holds the transmittance behind each sample."""
+    behind = ZERO
+    for m in range(end - 1, first - 1, -1):
+        worth = worths[m - first]
+        slope = grads[m] * (worth - behind)
+        grads[m] = slope * deltas[m]
+        if len(grad_deltas):
+            grad_deltas[m] = slope * densities[m]
+        behind += opacity_of(densities[m] * deltas[m]) * (worth - behind)
+
+
+@scalar_kernel
+def _longest(ray_first):
+    longest = 0
+    for r in range(len(ray_first) - 1):
+        longest = max(longest, ray_first[r + 1] - ray_first[r])
+    return longest
 
 
 @parallel_kernel
 def _differentiate(samples, weights, ray_first, by_density, stop, workers, upstream, grads):
-    values, deltas, _, _ = samples
-    grad_out, _, grad_depth, _ = upstream
+    values, deltas, features, positions = samples
+    grad_out, grad_opacity, grad_depth, grad_weights = upstream
     grad_values, grad_deltas, grad_features, grad_positions = grads
     num_rays, channels = grad_out.shape
+    longest = _longest(ray_first)
     for worker in prange(workers):
+        worths = np.empty(longest, np.float32)
         for block in range(worker, (num_rays + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE, workers):
             for r in range(block * _RAYS_AT_ONCE, min((block + 1) * _RAYS_AT_ONCE, num_rays)):
                 first, end = ray_first[r], ray_first[r + 1]
                 last = _transmit(values, deltas, by_density, stop, first, end, grad_values)
-                if len(grad_deltas):
-                    grad_deltas[last:end] = ZERO
-                _differentiate_ray(samples, by_density, first, last, r, upstream, grads)
+                _worths(features, positions, grad_out, grad_opacity, grad_depth, grad_weights, r, first, last, worths)
+                if by_density:
+                    _slopes_of_densities(values, deltas, first, last, worths, grad_values, grad_deltas)
+                else:
+                    _slopes_of_alphas(values, first, last, worths, grad_values)
                 for m in range(first, end):
                     for c in range(channels):
                         grad_features[m, c] = weights[m] * grad_out[r, c]
+                if len(grad_deltas):
+                    grad_deltas[last:end] = ZERO
                 if len(grad_positions):
                     for m in range(first, end):
                         grad_positions[m] = weights[m] * grad_depth[r]
