@@ -130,10 +130,19 @@ def is_forward_facing(scene: Scene) -> bool:
 
 
 def upward(scene: Scene) -> Tensor:
-    """The upward direction (3,), float64 of length 1: the scene's own, else the mean of the training cameras'."""
+    """The upward direction (3,), float64 of length 1: the scene's own, or what the training cameras say.
+
+    Cameras held level have their sides at right angles to it, wherever they look; where their sides leave that
+    open, as those of parallel cameras do, or contradict each other, it is the mean of the cameras' own.
+    """
     if scene.up is not None:
         return _unit(torch.tensor(scene.up, dtype=torch.float64))
-    mean = scene.train.R[:, :, 1].double().mean(0)
+    R = scene.train.R.double()
+    mean = R[:, :, 1].mean(0)
+    shares, directions = torch.linalg.eigh(R[:, :, 0].T @ R[:, :, 0] / len(R))
+    if float(shares[0]) < 0.01 and float(shares[1]) > 0.1:
+        level = directions[:, 0]
+        return _unit(level if float(level @ mean) >= 0 else -level)
     return _unit(mean) if float(mean.norm()) > 1e-6 else mean.new_tensor([0.0, 1.0, 0.0])
 
 

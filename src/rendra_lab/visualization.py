@@ -22,6 +22,7 @@ Picture = np.ndarray  # uint8, (H, W, 3)
 _PAPER = 255
 _INK = (40, 40, 40)
 _GAP_PX = 6
+_VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21908c", "27ad81", "5dc863", "aadc32", "fde725")
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
@@ -140,6 +141,49 @@ def silhouette_overlay(fit: Tensor, target: Tensor) -> Tensor:
     fit, target = fit[..., None], target[..., None]
     blue, orange = fit.new_tensor([0.15, 0.45, 0.9]), fit.new_tensor([0.95, 0.55, 0.1])
     return 1 - fit * target * 0.35 - fit * (1 - target) * (1 - blue) - (1 - fit) * target * (1 - orange)
+
+
+def viridis(value: Tensor) -> Tensor:
+    """Colours (..., 3) for values (...) in [0, 1], dark violet to light yellow, evenly spaced to the eye.
+
+    Nine of the map's colours, with straight lines between them. Source: van der Walt and Smith, 2015.
+    """
+    anchors = value.new_tensor([[int(color[at : at + 2], 16) / 255 for at in (0, 2, 4)] for color in _VIRIDIS])
+    place = value.nan_to_num(0.0).clamp(0, 1) * (len(anchors) - 1)
+    low = place.long().clamp(max=len(anchors) - 2)
+    flat = low.reshape(-1)
+    here, above = (anchors.index_select(0, index).reshape(*value.shape, 3) for index in (flat, flat + 1))
+    return here.lerp(above, (place - low)[..., None])
+
+
+def depth_limits(depth: Tensor, opacity: Tensor) -> tuple[float, float]:
+    """The nearest and the farthest distance worth a colour: all but 1 % of what is seen, on both ends."""
+    seen = depth[(opacity > 0.5) & depth.isfinite()]
+    if not len(seen):
+        return 0.0, 1.0
+    ordered = seen.double().sort().values
+    last = len(ordered) - 1
+    near, far = float(ordered[round(0.01 * last)]), float(ordered[round(0.99 * last)])
+    return near, max(far, near + 1e-6 * abs(near) + 1e-12)
+
+
+def depth_image(depth: Tensor, opacity: Tensor, limits: tuple[float, float] | None = None) -> Tensor:
+    """Distances (..., H, W) as colours (..., H, W, 3): near is yellow, far violet, white where nothing is.
+
+    Args:
+        depth: distances.
+        opacity: in [0, 1]; how much of the colour stands before white.
+        limits: the distances of the first and the last colour; None: `depth_limits` of this image.
+    """
+    near, far = depth_limits(depth, opacity) if limits is None else limits
+    color = viridis((far - depth) / (far - near))
+    cover = opacity.clamp(0, 1)[..., None]
+    return color * cover + (1 - cover)
+
+
+def normal_image(normals: Tensor) -> Tensor:
+    """Normals (..., H, W, 3) as the usual colours (n + 1) / 2; white where they are zero."""
+    return torch.where(normals.abs().amax(-1, keepdim=True) > 0, (normals + 1) / 2, 1)
 
 
 def save_picture(path: str | Path, picture: Picture) -> Path:
