@@ -120,9 +120,10 @@ def _march_on_cpu(
 ) -> tuple[Tensor, Tensor, Tensor]:
     results = _empty_results(grid, rays)
     n, r = rays.shape[:2]
-    settings = _settings(grid, rays, num_samples, mode, density_activation, feature_activation, stop_below)
+    cells = _cells(occupancy)
+    settings = _settings(grid, rays, cells, num_samples, mode, density_activation, feature_activation, stop_below)
     numba_cpu.forward(
-        grid.detach().contiguous().view(-1).numpy(), rays.reshape(n * r, 9).numpy(), _cells(occupancy), settings,
+        grid.detach().contiguous().view(-1).numpy(), rays.reshape(n * r, 9).numpy(), cells, settings,
         grid.shape[-1], tuple(each.view(n * r, *each.shape[2:]).numpy() for each in results),
     )  # fmt: skip
     return results
@@ -144,13 +145,14 @@ def _gradient_on_cpu(
     feature_activation: str,
     stop_below: float,
     upstream: Tensor,
-    upstream_scalars: Tensor,
+    of_scalars: Tensor,
 ) -> Tensor:
-    settings = _settings(grid, rays, num_samples, mode, density_activation, feature_activation, stop_below)
+    cells = _cells(occupancy)
+    settings = _settings(grid, rays, cells, num_samples, mode, density_activation, feature_activation, stop_below)
     count = rays.shape[0] * rays.shape[1]
     grad = numba_cpu.backward(
-        grid.detach().contiguous().view(-1).numpy(), rays.reshape(count, 9).numpy(), _cells(occupancy), settings,
-        upstream.reshape(count, grid.shape[-1]).numpy(), upstream_scalars.reshape(count, 2).numpy(),
+        grid.detach().contiguous().view(-1).numpy(), rays.reshape(count, 9).numpy(), cells, settings,
+        upstream.reshape(count, grid.shape[-1]).numpy(), of_scalars.reshape(count, 2).numpy(),
     )  # fmt: skip
     return torch.from_numpy(grad).view(grid.shape)
 
@@ -182,17 +184,18 @@ def _empty_results(grid: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _settings(
     grid: Tensor,
     rays: Tensor,
+    cells: np.ndarray,
     num_samples: int,
     mode: str,
     density_activation: str,
     feature_activation: str,
     stop_below: float,
 ) -> numba_cpu.Settings:
-    depth, height, width = grid.shape[1:4]
     n, r = rays.shape[:2]
+    activations = _ACTIVATIONS.index(density_activation), _ACTIVATIONS.index(feature_activation)
     return numba_cpu.Settings(
-        depth, height, width, max(1, n * r if len(grid) == 1 else r), num_samples, int(mode == "density"),
-        _ACTIVATIONS.index(density_activation), _ACTIVATIONS.index(feature_activation), np.float32(stop_below),
+        *grid.shape[1:4], *cells.shape, max(1, n * r if len(grid) == 1 else r), num_samples, mode == "density",
+        any(activations), *activations, np.float32(stop_below),
     )  # fmt: skip
 
 

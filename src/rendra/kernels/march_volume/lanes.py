@@ -3,6 +3,9 @@
 Lanes are a tuple of K float32, K a constant of the type, so that every loop over channels is a vector instruction.
 A cell is the 8 voxels around a point; two neighbours along x lie side by side in memory, so that a cell is 4 vectors
 of 2 K numbers. Nothing here looks at bounds: `numba_cpu` does.
+
+Memory is passed as pointers: an array that is handed from function to function has its references counted, atomically
+and by all threads, sample by sample. Whoever takes a pointer keeps the array alive.
 """
 
 from llvmlite import ir
@@ -49,9 +52,8 @@ def _slice(builder, vector, first, count):
     return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), mask)
 
 
-def _pointer(context, builder, array_type, array, at, count):
-    """Where `count` numbers of a flat array begin."""
-    data = context.make_array(array_type)(context, builder, array).data
+def _place(builder, data, at, count):
+    """Where `count` numbers begin."""
     return builder.bitcast(builder.gep(data, [at]), _vector(count).as_pointer())
 
 
@@ -67,16 +69,26 @@ def _both(builder, fraction):
 
 
 @intrinsic
+def pointer(typingctx, array):
+    """To the first element of a contiguous array."""
+
+    def codegen(context, builder, signature, arguments):
+        return context.make_array(signature.args[0])(context, builder, arguments[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic
 def gather(typingctx, flat, at, row, plane, fx, fy, fz, lanes):
     """The lanes at fractions f of a cell whose first voxel begins at flat[at]; rows and planes lie apart as said."""
 
     def codegen(context, builder, signature, arguments):
-        array, at, row, plane, fx, fy, fz, _ = arguments
+        data, at, row, plane, fx, fy, fz, _ = arguments
         count = len(lanes)
         along_y, along_z = _both(builder, fy), _both(builder, fz)
         total = ir.Constant(_vector(2 * count), [0.0] * (2 * count))
         for offset, y, z in _row_offsets(builder, at, row, plane):
-            pair = builder.load(_pointer(context, builder, signature.args[0], array, offset, 2 * count), align=4)
+            pair = builder.load(_place(builder, data, offset, 2 * count), align=4)
             weight = _splat(builder, builder.fmul(along_y[y], along_z[z]), 2 * count)
             total = _multiply_add(builder, pair, weight, total)
         near, far = (_slice(builder, total, first, count) for first in (0, count))
@@ -91,7 +103,7 @@ def scatter(typingctx, flat, at, row, plane, fx, fy, fz, lanes):
     """Add lanes to the voxels of a cell, each its share: the transpose of `gather`."""
 
     def codegen(context, builder, signature, arguments):
-        array, at, row, plane, fx, fy, fz, values = arguments
+        data, at, row, plane, fx, fy, fz, values = arguments
         count = len(lanes)
         along_x, along_y, along_z = (_both(builder, fraction) for fraction in (fx, fy, fz))
         scalars = [builder.extract_value(values, i) for i in range(count)]
@@ -99,7 +111,7 @@ def scatter(typingctx, flat, at, row, plane, fx, fy, fz, lanes):
         shares = _packed(builder, [along_x[0]] * count + [along_x[1]] * count)
         spread = builder.fmul(spread, shares)
         for offset, y, z in _row_offsets(builder, at, row, plane):
-            place = _pointer(context, builder, signature.args[0], array, offset, 2 * count)
+            place = _place(builder, data, offset, 2 * count)
             weight = _splat(builder, builder.fmul(along_y[y], along_z[z]), 2 * count)
             builder.store(_multiply_add(builder, spread, weight, builder.load(place, align=4)), place, align=4)
         return context.get_dummy_value()
@@ -112,7 +124,7 @@ def load(typingctx, flat, at, lanes):
     """The lanes that begin at flat[at]."""
 
     def codegen(context, builder, signature, arguments):
-        place = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], len(lanes))
+        place = _place(builder, arguments[0], arguments[1], len(lanes))
         return _lanes_of(context, builder, lanes, builder.load(place, align=4))
 
     return lanes(flat, types.intp, lanes), codegen
@@ -123,7 +135,7 @@ def store(typingctx, flat, at, lanes):
     """Write lanes to flat[at] and after."""
 
     def codegen(context, builder, signature, arguments):
-        place = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], len(lanes))
+        place = _place(builder, arguments[0], arguments[1], len(lanes))
         builder.store(_vector_of(builder, lanes, arguments[2]), place, align=4)
         return context.get_dummy_value()
 

@@ -1,7 +1,8 @@
 """Marching rays through a grid on the CPU: the fast twin of `reference.py`. See README.md for the backward pass.
 
 A ray is 9 numbers here: the place of sample 0 and the step between samples, in voxels, then the length of sample 0,
-the step in length and delta. The grid is flat; K channels of a voxel are `lanes`.
+the step in length and delta. The grid is flat; the K channels of a voxel are `lanes`. Arrays go to small functions
+as pointers, so all of them are made by `forward` and `backward`, which keep them alive.
 """
 
 import math
@@ -12,7 +13,7 @@ from numba import prange
 from numba.cpython.unsafe.tuple import tuple_setitem
 
 from rendra.kernels.geometry import ONE, ZERO, exponential, sigmoid
-from rendra.kernels.march_volume.lanes import add_scaled, dot, gather, load, multiplied, scatter, store
+from rendra.kernels.march_volume.lanes import add_scaled, dot, gather, load, multiplied, pointer, scatter, store
 from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 
 SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
@@ -28,12 +29,25 @@ class Settings(NamedTuple):
     depth: int  # voxels
     height: int
     width: int
+    cells_depth: int  # of the occupancy; 0 where there is none
+    cells_height: int
+    cells_width: int
     rays_per_grid: int
     samples: int
-    is_density: int
+    is_density: bool
+    is_bounded: bool  # by the outermost centres, instead of fading
     density_activation: int
     feature_activation: int
     stop_below: np.float32
+
+
+class _Chunk(NamedTuple):
+    """What rays leave for slabs: for each of `rays` rays, room for all of its samples."""
+
+    asked: np.ndarray  # (rays, S, K) gradients of samples
+    steps: np.ndarray  # (rays, S) which samples
+    pieces: np.ndarray  # (rays, slabs, 2) which of them are in a slab: begin, end
+    trails: np.ndarray  # (workers, 3, S) what a ray needs on its way back
 
 
 def forward(
@@ -45,7 +59,9 @@ def forward(
     results: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     """Write features (M, C), opacity (M,) and depth (M,) of M rays through a flat grid of `channels` a voxel."""
-    _march(grid, rays, occupancy, settings, (ZERO,) * channels, num_threads(), *results)
+    workers = num_threads()
+    cells = np.zeros((workers, 8 * channels), np.float32)
+    _march(grid, rays, occupancy, settings, (ZERO,) * channels, cells, *results)
 
 
 def backward(
@@ -54,44 +70,55 @@ def backward(
     occupancy: np.ndarray,
     settings: Settings,
     upstream: np.ndarray,
-    upstream_scalars: np.ndarray,
+    of_scalars: np.ndarray,
 ) -> np.ndarray:
-    """The gradient of the flat grid; `upstream` (M, K) has 0 and the features', the other (M, 2) opacity's and depth's."""
-    channels = upstream.shape[1]
-    rays_at_once = max(1, _BYTES_AT_ONCE // (4 * (channels + 1) * max(1, settings.samples)))
+    """The gradient of the flat grid.
+
+    `upstream` (M, K) is the gradient of 0 and the features, `of_scalars` (M, 2) that of opacity and depth.
+    """
+    channels, samples, workers = upstream.shape[1], settings.samples, num_threads()
+    rays_at_once = min(max(1, _BYTES_AT_ONCE // (4 * (channels + 1) * max(1, samples))), max(1, len(rays)))
+    cells = np.zeros((workers, 8 * channels), np.float32)
+    chunk = _Chunk(
+        np.empty((rays_at_once, samples, channels), np.float32),
+        np.empty((rays_at_once, samples), np.int32),
+        np.empty((rays_at_once, _SLABS, 2), np.int32),
+        np.empty((workers, 3, samples), np.float32),
+    )
     grad = np.zeros_like(grid)
-    _march_back(grid, rays, occupancy, settings, (ZERO,) * channels, num_threads(), upstream.reshape(-1),
-                upstream_scalars, min(rays_at_once, max(1, len(rays))), grad)  # fmt: skip
+    _march_back(grid, rays, occupancy, settings, (ZERO,) * channels, cells, upstream, of_scalars, *chunk, grad)
     return grad
 
 
 @parallel_kernel
-def _march(grid, rays, occupancy, settings, lanes, workers, features, opacity, depth):
-    blocks = (len(rays) + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE
+def _march(grid, rays, occupancy, settings, lanes, cells, features, opacity, depth):
+    workers, blocks = len(cells), (len(rays) + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE
     for worker in prange(workers):
-        cell = np.zeros(8 * len(lanes), np.float32)
+        inputs = pointer(grid), pointer(rays), pointer(occupancy)
+        cell = pointer(cells[worker])
         for block in range(worker, blocks, workers):
             for m in range(block * _RAYS_AT_ONCE, min((block + 1) * _RAYS_AT_ONCE, len(rays))):
-                total, left, length = _look(grid, rays, m, occupancy, settings, lanes, cell)
+                total, left, length = _look(inputs, m, settings, lanes, cell)
                 for c in range(features.shape[1]):
                     features[m, c] = total[c + 1]
                 opacity[m], depth[m] = ONE - left, length
 
 
 @scalar_kernel
-def _look(grid, rays, m, occupancy, settings, lanes, cell):
+def _look(inputs, m, settings, lanes, cell):
     """What a ray sees: lanes that have the features behind their first, transmittance, depth."""
+    grid, rays, occupancy = inputs
+    px, py, pz, dx, dy, dz, begin, step, delta = _ray(rays, m)
     if not _is_finite(rays, m):
         unknown = np.float32(np.nan)
         return add_scaled(lanes, unknown, lanes), unknown, unknown
-    px, py, pz, dx, dy, dz = rays[m, 0], rays[m, 1], rays[m, 2], rays[m, 3], rays[m, 4], rays[m, 5]
-    begin, step, delta = rays[m, 6], rays[m, 7], rays[m, 8]
-    first = m // settings.rays_per_grid * settings.depth * settings.height * settings.width * len(lanes)
+    first = _first(m, settings, lanes)
     faint = max(settings.stop_below, _NOTHING)
     total, left, depth = lanes, ONE, ZERO
     k, end = _span(rays, m, settings)
     while k < end and not abs(left) < faint:
-        x, y, z = px + np.float32(k) * dx, py + np.float32(k) * dy, pz + np.float32(k) * dz
+        i = np.float32(k)
+        x, y, z = px + i * dx, py + i * dy, pz + i * dz
         empty = _empty_steps(x, y, z, dx, dy, dz, occupancy, settings)
         if empty > 0:
             k += empty
@@ -102,54 +129,56 @@ def _look(grid, rays, m, occupancy, settings, lanes, cell):
             values = _sigmoids(values)
         weight = alpha * left
         total = add_scaled(total, weight, values)
-        depth += weight * (begin + np.float32(k) * step)
+        depth += weight * (begin + i * step)
         left *= ONE - alpha
         k += 1
     return total, left, depth
 
 
 @parallel_kernel
-def _march_back(grid, rays, occupancy, settings, lanes, workers, upstream, upstream_scalars, rays_at_once, grad):
+def _march_back(grid, rays, occupancy, settings, lanes, cells, upstream, of_scalars, asked, steps, pieces, trails, grad):
     """First rays make the gradients of their samples, then slabs add up those of their voxels; chunk by chunk."""
-    planes = (settings.depth + _SLABS - 1) // _SLABS
-    asked = np.empty(rays_at_once * settings.samples * len(lanes), np.float32)
-    steps = np.empty((rays_at_once, settings.samples), np.int32)
-    pieces = np.empty((rays_at_once, _SLABS, 2), np.int32)
-    for chunk in range(0, len(rays), rays_at_once):
-        count = min(rays_at_once, len(rays) - chunk)
+    workers, at_once = len(cells), len(steps)
+    for chunk in range(0, len(rays), at_once):
+        count = min(at_once, len(rays) - chunk)
         blocks = (count + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE
         for worker in prange(workers):
-            cell, trail = np.zeros(8 * len(lanes), np.float32), np.empty((3, settings.samples), np.float32)
+            inputs = pointer(grid), pointer(rays), pointer(occupancy)
+            upstreams = pointer(upstream), pointer(of_scalars)
+            notes = pointer(asked), pointer(steps), pointer(pieces), pointer(trails[worker])
+            cell = pointer(cells[worker])
             for block in range(worker, blocks, workers):
                 for r in range(block * _RAYS_AT_ONCE, min((block + 1) * _RAYS_AT_ONCE, count)):
-                    _look_back(grid, rays, chunk + r, occupancy, settings, lanes, cell, trail, planes,
-                               (upstream, upstream_scalars), (asked, r * settings.samples), steps[r], pieces[r])  # fmt: skip
+                    _look_back(inputs, chunk + r, settings, lanes, cell, upstreams, notes, r)
         for parity in range(2):
             for worker in prange(workers):
-                cell = np.zeros(8 * len(lanes), np.float32)
+                notes = pointer(asked), pointer(steps), pointer(pieces), pointer(trails[worker])
+                cell = pointer(cells[worker])
                 for slab in range(parity + 2 * worker, _SLABS, 2 * workers):
                     for r in range(count):
-                        _spread(rays, chunk + r, settings, lanes, cell, asked, r * settings.samples, steps[r],
-                                pieces[r, slab, 0], pieces[r, slab, 1], grad)  # fmt: skip
+                        _spread(pointer(rays), chunk + r, settings, lanes, cell, notes, r, slab, pointer(grad))
 
 
 @scalar_kernel
-def _look_back(grid, rays, m, occupancy, settings, lanes, cell, trail, planes, upstreams, asked_from, steps, pieces):
-    """The gradients of a ray's samples: lanes in `asked`, which samples in `steps`, and each slab's in `pieces`."""
-    upstream, scalars = upstreams
-    asked, place = asked_from
-    pieces[:] = 0
+def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
+    """The gradients of the samples of ray m, the r-th of its chunk."""
+    grid, rays, occupancy = inputs
+    upstream, of_scalars = upstreams
+    asked, steps, pieces, trail = notes
+    count, samples = len(lanes), settings.samples
+    for i in range(2 * _SLABS):
+        pieces[2 * _SLABS * r + i] = np.int32(0)
     if not _is_finite(rays, m):
         return
-    px, py, pz, dx, dy, dz = rays[m, 0], rays[m, 1], rays[m, 2], rays[m, 3], rays[m, 4], rays[m, 5]
-    begin, step, delta = rays[m, 6], rays[m, 7], rays[m, 8]
-    first = m // settings.rays_per_grid * settings.depth * settings.height * settings.width * len(lanes)
-    wanted = load(upstream, m * len(lanes), lanes)
-    of_depth = scalars[m, 1]
+    px, py, pz, dx, dy, dz, begin, step, delta = _ray(rays, m)
+    first, place = _first(m, settings, lanes), r * samples
+    wanted = load(upstream, m * count, lanes)
+    planes = (settings.depth + _SLABS - 1) // _SLABS
     left, entry, slab = ONE, 0, -1
     k, end = _span(rays, m, settings)
     while k < end and not abs(left) < settings.stop_below:
-        x, y, z = px + np.float32(k) * dx, py + np.float32(k) * dy, pz + np.float32(k) * dz
+        i = np.float32(k)
+        x, y, z = px + i * dx, py + i * dy, pz + i * dz
         empty = _empty_steps(x, y, z, dx, dy, dz, occupancy, settings)
         if empty > 0:
             k += empty
@@ -160,41 +189,44 @@ def _look_back(grid, rays, m, occupancy, settings, lanes, cell, trail, planes, u
         if settings.feature_activation == SIGMOID:
             values = _sigmoids(values)
             pull = multiplied(pull, add_scaled(values, -ONE, multiplied(values, values)))
-        store(asked, (place + entry) * len(lanes), pull)
-        trail[0, entry], trail[1, entry] = alpha, left * slope
-        trail[2, entry] = dot(wanted, values) + of_depth * (begin + np.float32(k) * step)
-        here = min(max(int(math.floor(z)), 0), settings.depth - 1) // planes
+        store(asked, (place + entry) * count, pull)
+        trail[entry], trail[samples + entry] = alpha, left * slope
+        trail[2 * samples + entry] = dot(wanted, values) + of_scalars[2 * m + 1] * (begin + i * step)
+        here = min(max(_floor(z), 0), settings.depth - 1) // planes
         if here != slab:
             slab = here
-            pieces[slab, 0] = entry
-        steps[entry] = k
+            pieces[2 * (_SLABS * r + slab)] = np.int32(entry)
+        steps[place + entry] = np.int32(k)
         entry += 1
-        pieces[slab, 1] = entry
+        pieces[2 * (_SLABS * r + slab) + 1] = np.int32(entry)
         left *= ONE - alpha
         k += 1
-    behind = -scalars[m, 0]
-    for i in range(entry - 1, -1, -1):
-        asked[(place + i) * len(lanes)] = trail[1, i] * (trail[2, i] - behind)
-        behind += trail[0, i] * (trail[2, i] - behind)
+    behind = -of_scalars[2 * m]
+    for entry in range(entry - 1, -1, -1):
+        gain = trail[2 * samples + entry] - behind
+        asked[(place + entry) * count] = trail[samples + entry] * gain
+        behind += trail[entry] * gain
 
 
 @scalar_kernel
-def _spread(rays, m, settings, lanes, cell, asked, place, steps, begin, end, grad):
-    """Add a piece of a ray to the voxels of its slab."""
-    count = len(lanes)
-    row, plane = settings.width * count, settings.height * settings.width * count
-    first = m // settings.rays_per_grid * settings.depth * plane
-    px, py, pz, dx, dy, dz = rays[m, 0], rays[m, 1], rays[m, 2], rays[m, 3], rays[m, 4], rays[m, 5]
+def _spread(rays, m, settings, lanes, cell, notes, r, slab, grad):
+    """Add the piece of a ray that is in a slab to its voxels."""
+    asked, steps, pieces, _ = notes
+    count, place = len(lanes), r * settings.samples
+    begin, end = pieces[2 * (_SLABS * r + slab)], pieces[2 * (_SLABS * r + slab) + 1]
+    row, plane, first = settings.width * count, settings.height * settings.width * count, _first(m, settings, lanes)
+    px, py, pz, dx, dy, dz, _, _, _ = _ray(rays, m)
     for entry in range(begin, end):
-        k = np.float32(steps[entry])
-        x, y, z = px + k * dx, py + k * dy, pz + k * dz
-        ix, iy, iz = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+        i = np.float32(steps[place + entry])
+        x, y, z = px + i * dx, py + i * dy, pz + i * dz
+        ix, iy, iz = _floor(x), _floor(y), _floor(z)
         fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
         values = load(asked, (place + entry) * count, lanes)
         if _is_inside(ix, iy, iz, settings):
             scatter(grad, first + iz * plane + iy * row + ix * count, row, plane, fx, fy, fz, values)
             continue
-        cell[:] = ZERO
+        for c in range(8 * count):
+            cell[c] = ZERO
         scatter(cell, 0, 2 * count, 4 * count, fx, fy, fz, values)
         for corner in range(8):
             at = _corner(corner, ix, iy, iz, settings)
@@ -204,11 +236,33 @@ def _spread(rays, m, settings, lanes, cell, asked, place, steps, begin, end, gra
 
 
 @scalar_kernel
+def _ray(rays, m):
+    at = 9 * m
+    return (
+        rays[at], rays[at + 1], rays[at + 2], rays[at + 3], rays[at + 4], rays[at + 5],
+        rays[at + 6], rays[at + 7], rays[at + 8],
+    )  # fmt: skip
+
+
+@scalar_kernel
+def _first(m, settings, lanes):
+    """Where the grid of a ray begins."""
+    return m // settings.rays_per_grid * settings.depth * settings.height * settings.width * len(lanes)
+
+
+@scalar_kernel
+def _floor(x):
+    """The integer below; a library call is slower than a sample."""
+    i = int(x)
+    return i - 1 if x < np.float32(i) else i
+
+
+@scalar_kernel
 def _read(grid, first, x, y, z, settings, lanes, cell):
     """The lanes at a point; voxels outside count as 0."""
     count = len(lanes)
     row, plane = settings.width * count, settings.height * settings.width * count
-    ix, iy, iz = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    ix, iy, iz = _floor(x), _floor(y), _floor(z)
     fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
     if _is_inside(ix, iy, iz, settings):
         return gather(grid, first + iz * plane + iy * row + ix * count, row, plane, fx, fy, fz, lanes)
@@ -241,18 +295,18 @@ def _corner(corner, ix, iy, iz, settings):
 def _is_finite(rays, m):
     total = ZERO
     for i in range(9):
-        total += rays[m, i] * ZERO
+        total += rays[9 * m + i] * ZERO
     return total == ZERO
 
 
 @scalar_kernel
 def _span(rays, m, settings):
     """The samples [begin, end) that can meet the volume, and at most a few more."""
-    margin = ONE if settings.density_activation + settings.feature_activation == 0 else ZERO
+    margin = ZERO if settings.is_bounded else ONE
     low, high = ZERO, np.float32(settings.samples)
     for axis in range(3):
         size = settings.width if axis == 0 else (settings.height if axis == 1 else settings.depth)
-        place, step = rays[m, axis], rays[m, 3 + axis]
+        place, step = rays[9 * m + axis], rays[9 * m + 3 + axis]
         near, far = -margin - place, np.float32(size - 1) + margin - place
         if step == ZERO:
             if near > ZERO or far < ZERO:
@@ -269,17 +323,17 @@ def _span(rays, m, settings):
 def _empty_steps(x, y, z, dx, dy, dz, occupancy, settings):
     """How many steps from a sample are surely empty; 0 if it counts."""
     width, height, depth = settings.width - 1, settings.height - 1, settings.depth - 1
-    if settings.density_activation + settings.feature_activation > 0 and not (
+    if settings.is_bounded and not (
         x >= ZERO and y >= ZERO and z >= ZERO
         and x <= np.float32(width) and y <= np.float32(height) and z <= np.float32(depth)
     ):  # fmt: skip
         return 1
-    if len(occupancy) == 0:
+    if settings.cells_depth == 0:
         return 0
-    ix, sx = _cell_along(x, dx, width, occupancy.shape[2])
-    iy, sy = _cell_along(y, dy, height, occupancy.shape[1])
-    iz, sz = _cell_along(z, dz, depth, occupancy.shape[0])
-    if occupancy[iz, iy, ix] != 0:
+    ix, sx = _cell_along(x, dx, width, settings.cells_width)
+    iy, sy = _cell_along(y, dy, height, settings.cells_height)
+    iz, sz = _cell_along(z, dz, depth, settings.cells_depth)
+    if occupancy[(iz * settings.cells_height + iy) * settings.cells_width + ix] != 0:
         return 0
     return max(1, int(min(sx, min(sy, sz))))
 
@@ -292,12 +346,10 @@ def _cell_along(x, dx, last, count):
         return 0, many
     scale = np.float32(count) / np.float32(last)
     u, du = x * scale, dx * scale
-    i = min(max(int(math.floor(u)), 0), count - 1)
-    if du == ZERO:
+    i = min(max(_floor(u), 0), count - 1)
+    if du == ZERO or (du > ZERO and i == count - 1) or (du < ZERO and i == 0):
         return i, many
     border = np.float32(i + 1) if du > ZERO else np.float32(i)
-    if (du > ZERO and i == count - 1) or (du < ZERO and i == 0):
-        return i, many
     return i, min(max((border - u) / du, ZERO), many)
 
 
