@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
+from rendra_lab.errors import UserError
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 
@@ -30,7 +31,7 @@ class MLPField(RadianceField):
     def __init__(self, chunk: int) -> None:
         super().__init__()
         if chunk < 1:
-            raise ValueError(f"chunk must be at least 1, got {chunk}")
+            raise UserError(f"field.chunk must be at least 1, got {chunk}")
         self.chunk = chunk
 
     @abstractmethod
@@ -133,8 +134,8 @@ class MLPBook(MLPField):
 class MLPOriginal(MLPField):
     """The network of Mildenhall et al., "NeRF", ECCV 2020, Fig. 7. Its matter is a density.
 
-    As in their code the encoding begins with the input itself and its frequencies are 2^i, without pi. Weights start
-    as theirs do (Glorot, biases 0), but for the bias of the density: a ReLU that is 0 everywhere never learns.
+    As in their code the encoding begins with the input itself and its frequencies are 2^i, without pi. The density
+    starts thin and above 0 everywhere: a ReLU that is 0 everywhere never learns, and theirs is with some seeds.
 
     Args:
         width: C; the last colour layer has half of it.
@@ -161,7 +162,7 @@ class MLPOriginal(MLPField):
     ) -> None:
         super().__init__(chunk)
         if skip is not None and not 0 <= skip < depth - 1:
-            raise ValueError(f"skip must be null or the index of a layer before the last of {depth}, got {skip}")
+            raise UserError(f"field.skip must be null or the index of a layer before the last of {depth}, got {skip}")
         self.width, self.skip = width, skip
         self.frequencies, self.direction_frequencies = frequencies, direction_frequencies
         self.noise_std, self.normalize = noise_std, normalize
@@ -172,8 +173,7 @@ class MLPOriginal(MLPField):
         self.features = nn.Linear(width, width)
         self.color = nn.Linear(width + 3 + 6 * direction_frequencies, width // 2)
         self.rgb = nn.Linear(width // 2, 3)
-        self.apply(_start_as_glorot)
-        nn.init.constant_(self.density.bias, 0.1)
+        nn.init.constant_(self.density.bias, 0.1)  # more than the weights differ by at first
 
     def _matter(self, points: Tensor) -> tuple[Tensor, Tensor]:
         at = (points - self.box.mean(0)) / self._unit() if self.normalize else points
@@ -212,9 +212,3 @@ def _encoded(x: Tensor, frequencies: int) -> Tensor:
     angles = x[:, None] * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)[:, None]  # (M, L, 3)
     waves = torch.stack([angles.sin(), angles.cos()], dim=2)  # (M, L, 2, 3)
     return torch.cat([x, waves.flatten(1)], dim=1)
-
-
-def _start_as_glorot(module: nn.Module) -> None:
-    if isinstance(module, nn.Linear):
-        nn.init.xavier_uniform_(module.weight)
-        nn.init.zeros_(module.bias)

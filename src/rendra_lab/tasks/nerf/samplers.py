@@ -6,6 +6,8 @@ Letters: Q rays, S samples along each.  Distances are world units along the ray.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra.ops.sample_pdf import sample_pdf
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
@@ -29,6 +32,8 @@ class DenseRenderer(RayRenderer):
         jitter: move samples at random in training.
         disparity: spread samples evenly in 1 / distance, for scenes that go far back.
         endless: let the last sample reach infinitely far, as the original does; else to where the ray leaves.
+        depth_range: look between these two distances along every ray, wherever it meets the box of the scene. Fields
+            whose matter is the opacity of a sample need it: their samples must be equally far apart on all rays.
         rays_at_once: see `RayRenderer`.
     """
 
@@ -38,12 +43,18 @@ class DenseRenderer(RayRenderer):
         jitter: bool = True,
         disparity: bool = False,
         endless: bool = False,
+        depth_range: Sequence[float] | None = None,
         rays_at_once: int = 2048,
     ) -> None:
         super().__init__(field, rays_at_once)
+        if depth_range is not None and not (len(depth_range) == 2 and 0 <= depth_range[0] < depth_range[1]):
+            raise UserError(
+                f"sampler.depth_range is two ascending distances, such as [0.1, 3.0], or null; got {depth_range}"
+            )
         self.jitter = jitter
         self.disparity = disparity
         self.endless = endless
+        self.depth_range = depth_range
 
     @abstractmethod
     def look(self, rays: Rays) -> RaysSeen:
@@ -51,6 +62,9 @@ class DenseRenderer(RayRenderer):
 
     def render(self, rays: Rays) -> RaysSeen:
         """What rays see; nothing where they miss the scene, and nothing is asked there."""
+        if self.depth_range is not None:
+            near, far = (torch.full_like(rays.nearest, distance) for distance in self.depth_range)
+            rays = replace(rays, nearest=near, farthest=far)
         meets = (rays.farthest > rays.nearest).nonzero()[:, 0]
         if len(meets) == len(rays.nearest):
             return self.look(rays)
@@ -174,4 +188,4 @@ def composite(alpha: Tensor, rgb: Tensor, distances: Tensor) -> tuple[Tensor, Ra
 def _at_least(least: int, **numbers: int) -> None:
     for name, number in numbers.items():
         if number < least:
-            raise ValueError(f"{name} must be at least {least}, got {number}")
+            raise UserError(f"sampler.{name} must be at least {least}, got {number}")
