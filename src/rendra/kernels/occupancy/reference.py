@@ -1,0 +1,108 @@
+"""Samples of rays in the occupied cells of a box, the specification: plain torch, any device, any float type, slow.
+
+Sample k of a ray reaches from t_k to min(t_{k+1}, farthest), where
+
+    t_k = d(u + (offset + k) step),    d(u) = u up to the knee K = step / growth, K (1 + growth)^((u - K) / step) behind,
+
+and d(u) is `nearest` for offset = k = 0: steps are equally long up to the knee, then `growth` times the distance at
+which they begin. Without growth there is no knee. The rules:
+1. A sample exists if k < 2^24 and t_k < farthest.
+2. It is kept if its middle (t_k + min(t_{k+1}, farthest)) / 2 lies in an occupied cell: floor((o + t d - low) cells /
+   (high - low)) along each axis, so that a point between two cells belongs to the upper one and the upper faces of
+   the box lie outside.
+3. A ray has none if nearest < farthest fails, its direction is zero, or any number but `farthest` is not finite.
+4. Of a ray's samples the first `max_samples` are kept.
+All samples are asked, up to the distance behind which no point of the box can lie, some at a time.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+LATTICE_END = 2**24
+_SAMPLES_AT_ONCE = 2**20
+
+
+def traverse(
+    origins: Tensor,
+    directions: Tensor,
+    nearest: Tensor,
+    farthest: Tensor,
+    offset: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    step: float,
+    growth: float,
+    max_samples: int | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """First sample of each ray (R + 1,), and starts, ends and ray (M,) of the samples."""
+    sizes = _lattice_sizes(origins, directions, nearest, farthest, offset, box, step, growth)
+    longest = int(sizes.max()) if len(sizes) else 0
+    parts = [(nearest[:0], nearest[:0], sizes[:0])]
+    rows = max(1, _SAMPLES_AT_ONCE // max(1, longest))
+    for rays in torch.arange(len(origins), device=origins.device).split(rows):
+        here = [x[rays] for x in (origins, directions, nearest, farthest, offset)]
+        for first in range(0, int(sizes[rays].max()), _SAMPLES_AT_ONCE):
+            k = torch.arange(first, min(first + _SAMPLES_AT_ONCE, longest), device=origins.device)
+            starts, ends, kept = _samples(*here, k, occupied, box, step, growth)
+            kept &= k < sizes[rays, None]
+            parts.append((starts[kept], ends[kept], rays[:, None].expand_as(kept)[kept]))
+    starts, ends, index = (torch.cat(column) for column in zip(*parts, strict=True))
+    if max_samples is not None:
+        kept = torch.arange(len(index), device=index.device) < _firsts(index, len(origins))[index] + max_samples
+        starts, ends, index = starts[kept], ends[kept], index[kept]
+    return _firsts(index, len(origins)), starts, ends, index
+
+
+def _lattice_sizes(
+    origins: Tensor, directions: Tensor, nearest: Tensor, farthest: Tensor, offset: Tensor, box: Tensor, step: float,
+    growth: float,
+) -> Tensor:  # fmt: skip
+    """A bound (R,) on the number of samples to ask."""
+    is_ray = (nearest < farthest) & (directions != 0).any(1) & nearest.isfinite()
+    is_ray &= origins.isfinite().all(1) & directions.isfinite().all(1)
+    corners = torch.cartesian_prod(*box.T)
+    reach = torch.linalg.norm(corners - origins[:, None], dim=-1).amax(1) / torch.linalg.norm(directions, dim=-1)
+    end = torch.minimum(farthest, 1.001 * reach.nan_to_num(math.inf) + 2 * step)
+    steps = (_place(end, step, growth) - _place(nearest, step, growth)) / step * 1.001 + 4
+    return torch.where(is_ray, steps.clamp(0, LATTICE_END), 0).to(torch.int64)
+
+
+def _samples(
+    origins: Tensor, directions: Tensor, nearest: Tensor, farthest: Tensor, offset: Tensor, k: Tensor,
+    occupied: Tensor, box: Tensor, step: float, growth: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Starts, ends (R, K) of samples k of some rays, and which are kept."""
+    base, pace = _place(nearest, step, growth)[:, None], nearest.new_tensor(step)
+    edges = torch.stack((k, k + 1)).to(nearest.dtype)[:, None]
+    starts, ends = _distance(base + (offset[:, None] + edges) * pace, step, growth)
+    exists = starts < farthest[:, None]
+    ends = torch.minimum(ends, farthest[:, None])
+    size = torch.tensor(occupied.shape[::-1], device=box.device)
+    scale = size.to(box.dtype) / (box[1] - box[0])
+    middles = (0.5 * (starts + ends))[..., None]
+    places = ((origins[:, None] + middles * directions[:, None] - box[0]) * scale).floor()
+    inside = ((places >= 0) & (places < size)).all(-1)
+    x, y, z = torch.where(inside[..., None], places, 0.0).to(torch.int64).unbind(-1)
+    return starts, ends, exists & inside & occupied[z, y, x]
+
+
+def _distance(place: Tensor, step: float, growth: float) -> Tensor:
+    if growth == 0:
+        return place
+    knee, rate = place.new_tensor(step / growth), place.new_tensor(math.log1p(growth) / step)
+    return torch.where(place > knee, knee * torch.exp((place - knee) * rate), place)
+
+
+def _place(distance: Tensor, step: float, growth: float) -> Tensor:
+    """The inverse of `_distance`."""
+    if growth == 0:
+        return distance
+    knee, rate = distance.new_tensor(step / growth), distance.new_tensor(math.log1p(growth) / step)
+    return torch.where(distance > knee, knee + torch.log(distance / knee) / rate, distance)
+
+
+def _firsts(index: Tensor, num_rays: int) -> Tensor:
+    """First sample of each ray (R + 1,) of samples sorted by ray."""
+    return torch.searchsorted(index, torch.arange(num_rays + 1, device=index.device))
