@@ -86,6 +86,9 @@ def _short_name(function: Callable[..., Any]) -> str:
 scalar_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Decorator for the small functions that kernels call."""
 
+inlined_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+"""The same for what an inner loop calls with many arguments: a copy goes into every caller."""
+
 reassociating_kernel = numba.njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"}
 )

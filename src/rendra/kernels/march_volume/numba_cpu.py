@@ -14,7 +14,7 @@ from numba.cpython.unsafe.tuple import tuple_setitem
 
 from rendra.kernels.geometry import ONE, ZERO, exponential, sigmoid
 from rendra.kernels.march_volume.lanes import add_scaled, dot, gather, load, multiplied, pointer, scatter, store
-from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
+from rendra.kernels.parallel import inlined_kernel, num_threads, parallel_kernel, scalar_kernel
 
 SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
@@ -235,7 +235,7 @@ def _spread(rays, m, settings, lanes, cell, notes, r, slab, grad):
                     grad[first + at * count + c] += cell[corner * count + c]
 
 
-@scalar_kernel
+@inlined_kernel
 def _ray(rays, m):
     at = 9 * m
     return (
@@ -244,20 +244,20 @@ def _ray(rays, m):
     )  # fmt: skip
 
 
-@scalar_kernel
+@inlined_kernel
 def _first(m, settings, lanes):
     """Where the grid of a ray begins."""
     return m // settings.rays_per_grid * settings.depth * settings.height * settings.width * len(lanes)
 
 
-@scalar_kernel
+@inlined_kernel
 def _floor(x):
     """The integer below; a library call is slower than a sample."""
     i = int(x)
     return i - 1 if x < np.float32(i) else i
 
 
-@scalar_kernel
+@inlined_kernel
 def _read(grid, first, x, y, z, settings, lanes, cell):
     """The lanes at a point; voxels outside count as 0."""
     count = len(lanes)
@@ -273,7 +273,7 @@ def _read(grid, first, x, y, z, settings, lanes, cell):
     return gather(cell, 0, 2 * count, 4 * count, fx, fy, fz, lanes)
 
 
-@scalar_kernel
+@inlined_kernel
 def _is_inside(ix, iy, iz, settings):
     """Whether all 8 voxels of a cell exist."""
     return (
@@ -282,7 +282,7 @@ def _is_inside(ix, iy, iz, settings):
     )  # fmt: skip
 
 
-@scalar_kernel
+@inlined_kernel
 def _corner(corner, ix, iy, iz, settings):
     """Which voxel is a corner of a cell; -1 if outside."""
     x, y, z = ix + (corner & 1), iy + (corner >> 1 & 1), iz + (corner >> 2)
@@ -291,7 +291,7 @@ def _corner(corner, ix, iy, iz, settings):
     return (z * settings.height + y) * settings.width + x
 
 
-@scalar_kernel
+@inlined_kernel
 def _is_finite(rays, m):
     total = ZERO
     for i in range(9):
@@ -299,7 +299,7 @@ def _is_finite(rays, m):
     return total == ZERO
 
 
-@scalar_kernel
+@inlined_kernel
 def _span(rays, m, settings):
     """The samples [begin, end) that can meet the volume, and at most a few more."""
     margin = ZERO if settings.is_bounded else ONE
@@ -319,7 +319,7 @@ def _span(rays, m, settings):
     return max(0, int(low) - 1), min(settings.samples, int(high) + 2)
 
 
-@scalar_kernel
+@inlined_kernel
 def _empty_steps(x, y, z, dx, dy, dz, occupancy, settings):
     """How many steps from a sample are surely empty; 0 if it counts."""
     width, height, depth = settings.width - 1, settings.height - 1, settings.depth - 1
@@ -338,7 +338,7 @@ def _empty_steps(x, y, z, dx, dy, dz, occupancy, settings):
     return max(1, int(min(sx, min(sy, sz))))
 
 
-@scalar_kernel
+@inlined_kernel
 def _cell_along(x, dx, last, count):
     """The cell of the occupancy around x, and the steps up to its end, within reason."""
     many = np.float32(1 << 20)
@@ -353,7 +353,7 @@ def _cell_along(x, dx, last, count):
     return i, min(max((border - u) / du, ZERO), many)
 
 
-@scalar_kernel
+@inlined_kernel
 def _opacity(raw, delta, settings):
     """The opacity of a sample, and its derivative with respect to the raw value."""
     if raw != raw:
@@ -374,7 +374,7 @@ def _opacity(raw, delta, settings):
     return value, slope
 
 
-@scalar_kernel
+@inlined_kernel
 def _sigmoids(lanes):
     for c in range(len(lanes)):
         lanes = tuple_setitem(lanes, c, sigmoid(lanes[c]))
