@@ -44,7 +44,9 @@ class RayRenderer(nn.Module, ABC):
 
     def place(self, scene: Scene) -> None:
         """Say where the scene lies, before the first step."""
-        self.field.place(scene.box)
+        for module in self.modules():
+            if isinstance(module, RadianceField):
+                module.place(scene.box)
 
     def refresh(self, step: int) -> None:
         """Called before every training step: a renderer that remembers empty space looks again now and then."""
