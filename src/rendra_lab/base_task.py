@@ -60,6 +60,11 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         """Every metric on this batch, by name."""
         return {name: _named(name, term, prediction, batch) for name, term in self.metrics.items()}
 
+    def observe(self, batch: BatchT) -> PredictionT:
+        """What evaluation predicts; modes, gradients and random state stay untouched."""
+        with self._observed():
+            return self.predict(batch)
+
     def show(self, batch: BatchT) -> dict[str, Tensor]:
         """The panels of a batch, as evaluation sees it; modes, gradients and random state stay untouched."""
         with self._observed():

@@ -1,9 +1,8 @@
-"""What accompanies a run: progress, timing, images, animations and meshes. The only writers of such files."""
+"""What accompanies a run: timing, images, animations and meshes. The only writers of such files."""
 
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar
 
 from rendra.io import IO
 from rendra_lab import report, visualization
@@ -25,95 +23,6 @@ from rendra_lab.loggers import TensorBoard
 def every(step: int, interval: int) -> bool:
     """Whether a step, counted from 0, is due; an interval of 0 is never."""
     return interval > 0 and step % interval == 0
-
-
-class Progress(ProgressBar):
-    """Steps, losses, speed and time left: a live line in a terminal, a printed line now and then elsewhere.
-
-    Args:
-        refresh_s: seconds between drawings in a terminal.
-        line_s: seconds between lines where the output is no terminal.
-    """
-
-    def __init__(self, refresh_s: float = 0.1, line_s: float = 10.0) -> None:
-        super().__init__()
-        self.interval_s = refresh_s if sys.stdout.isatty() else line_s
-        self._enabled = True
-        self._bar: Any = None
-        self._started = (0.0, 0)  # time and step at the start of the fit
-        self._drawn = 0.0
-
-    def disable(self) -> None:
-        """Lightning's switch: says nothing from now on."""
-        self._enabled = False
-
-    def enable(self) -> None:
-        """Lightning's switch: speaks again."""
-        self._enabled = True
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Opens the line."""
-        self._started = (time.perf_counter(), trainer.global_step)
-        self._drawn = self._started[0]
-        if self._enabled and sys.stdout.isatty():
-            self._bar = _open_bar(_end_of(trainer), trainer.global_step)
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Draws, if enough time has passed since the last drawing."""
-        now = time.perf_counter()
-        if self._enabled and now - self._drawn >= self.interval_s:
-            self._drawn = now
-            self._draw(trainer)
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draws the end and closes the line."""
-        if self._bar is not None:
-            self._draw(trainer)
-        self._close()
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Gives the terminal back."""
-        self._close()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
-
-    def _draw(self, trainer: Trainer) -> None:
-        losses = {name.removeprefix("train/"): value for name, value in trainer.progress_bar_metrics.items()}
-        text = "  ".join(f"{name} {float(value):.4g}" for name, value in losses.items())
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=trainer.global_step, losses=text)
-            self._bar.refresh()
-            return
-        end = _end_of(trainer)
-        speed = (trainer.global_step - self._started[1]) / max(time.perf_counter() - self._started[0], 1e-9)
-        print_line = f"step {trainer.global_step}{'' if end is None else f'/{end}'}  {speed:.1f}/s  {text}\n"
-        sys.stdout.write(print_line)
-        sys.stdout.flush()
-
-
-def _end_of(trainer: Trainer) -> int | None:
-    total = trainer.estimated_stepping_batches
-    return int(total) if 0 < total < float("inf") else None
-
-
-def _open_bar(end: int | None, step: int) -> Any:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        BarColumn(30),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[losses]}"),
-    )
-    bar = Progress(*columns, auto_refresh=False)
-    bar.add_task("", total=end, completed=step, losses="")
-    bar.start()
-    return bar
 
 
 class StepTimer(Callback):
@@ -174,7 +83,7 @@ class LastStepKeeper(Callback):
 
 
 class ImageLogger(Callback):
-    """Writes the panels of a task, side by side, as PNG files and to TensorBoard: the only writer of images.
+    """Writes the panels of a fit, side by side, as PNG files and to TensorBoard.
 
     The fit leaves `step_000050.png` at intervals, `final.png`, and `story.png`, which shows beginning, middle
     and end in rows. Validation leaves its first batch.
@@ -214,21 +123,15 @@ class ImageLogger(Callback):
     ) -> None:
         """Shows the first batch of a validation."""
         if batch_idx == 0 and not trainer.sanity_checking and _shows(trainer, pl_module, "panels"):
-            self._publish(trainer, _pictures(pl_module, batch), "val", f"val_{trainer.global_step:06d}.png")
+            _publish(
+                trainer, _pictures(pl_module, batch), "val/panels", self.folder / f"val_{trainer.global_step:06d}.png"
+            )
 
     def _write(self, trainer: Trainer, pl_module: LightningModule, name: str) -> None:
         pictures = _pictures(pl_module, self._batch)
         if pictures:
             self._shown.append((trainer.global_step, pictures))
-            self._publish(trainer, pictures, "train", name)
-
-    def _publish(self, trainer: Trainer, pictures: dict[str, np.ndarray], stage: str, name: str) -> None:
-        if not pictures:
-            return
-        sheet = visualization.captioned_row(pictures)
-        visualization.save_picture(self.folder / name, sheet)
-        for writer in _writers(trainer):
-            writer.add_image(f"{stage}/panels", sheet, trainer.global_step, dataformats="HWC")
+            _publish(trainer, pictures, "train/panels", self.folder / name)
 
     def _thin_out(self) -> None:
         if len(self._shown) >= self.max_files:
@@ -357,37 +260,68 @@ class FactWriter(Callback):
         self._batch = None
 
 
-class SequenceReport(Callback):
-    """Shows a fitted sequence in the test: `sequence.gif` of every batch's panels, `frames.csv` of its metrics.
+class BatchReport(Callback):
+    """Shows a test batch by batch: a table of its metrics, and its panels as an animation or single pictures.
 
     Args:
-        folder: of the files.
+        table: path of the CSV file: a row a batch, which begins with its number as `frame`, or with its name as
+            `view` where the data module has `test_labels`.
+        animation: path of a .gif or .mp4 of the panels, a frame a batch; None leaves it out.
+        pictures: folder for the panels as `test_000.png` and so on, also shown in TensorBoard; None: nowhere.
+        max_pictures: of these, evenly spread over the batches.
         fps: frames a second.
         height_px: of the panels in a frame.
     """
 
-    def __init__(self, folder: str, fps: float = 8.0, height_px: int = 192) -> None:
-        self.folder = Path(folder)
+    def __init__(
+        self,
+        table: str,
+        animation: str | None = None,
+        pictures: str | None = None,
+        max_pictures: int = 24,
+        fps: float = 8.0,
+        height_px: int = 192,
+    ) -> None:
+        self.table = Path(table)
+        self.animation = None if animation is None else Path(animation)
+        self.pictures = None if pictures is None else Path(pictures)
+        self.max_pictures = max_pictures
         self.fps = fps
         self.height_px = height_px
         self._frames: list[np.ndarray] = []
-        self._rows: list[dict[str, float]] = []
+        self._rows: list[dict[str, Any]] = []
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
     ) -> None:
         """Keeps one frame and its numbers."""
-        if trainer.is_global_zero and isinstance(pl_module, BaseTask):
-            numbers = {name: float(value) for name, value in outputs.items() if isinstance(value, torch.Tensor)}
-            self._rows.append({"frame": batch_idx, **numbers})
-            self._frames.append(visualization.captioned_row(_pictures(pl_module, batch), self.height_px))
+        if not trainer.is_global_zero or not isinstance(pl_module, BaseTask):
+            return
+        labels = getattr(trainer.datamodule, "test_labels", None)  # type: ignore[attr-defined]
+        name = {"frame": batch_idx} if labels is None else {"view": labels[batch_idx]}
+        numbers = {key: float(value) for key, value in outputs.items() if isinstance(value, torch.Tensor)}
+        self._rows.append({**name, **numbers})
+        if self.animation is None and not self._is_chosen(trainer, batch_idx):
+            return
+        shown = _pictures(pl_module, batch)
+        if shown and self.animation is not None:
+            self._frames.append(visualization.captioned_row(shown, self.height_px))
+        if self.pictures is not None and self._is_chosen(trainer, batch_idx):
+            _publish(trainer, shown, f"test/{batch_idx:03d}", self.pictures / f"test_{batch_idx:03d}.png")
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the files."""
-        if self._frames:
-            visualization.save_animation(self.folder / "sequence.gif", self._frames, self.fps)
-            report.write_csv(self.folder / "frames.csv", self._rows)
+        if self._frames and self.animation is not None:
+            visualization.save_animation(self.animation, self._frames, self.fps)
+        if self._rows:
+            report.write_csv(self.table, self._rows)
         self._frames, self._rows = [], []
+
+    def _is_chosen(self, trainer: Trainer, batch_idx: int) -> bool:
+        if self.pictures is None:
+            return False
+        total = int(trainer.num_test_batches[0])
+        return batch_idx in _spread(list(range(total)), self.max_pictures)
 
 
 class StopWhenSettled(Callback):
@@ -438,6 +372,16 @@ class StopWhenSettled(Callback):
         self._best, self._waited = state_dict["best"], state_dict["waited"]
 
 
+def _publish(trainer: Trainer, pictures: dict[str, np.ndarray], tag: str, path: Path) -> None:
+    """Pictures in a row, as a file and in TensorBoard."""
+    if not pictures:
+        return
+    sheet = visualization.captioned_row(pictures)
+    visualization.save_picture(path, sheet)
+    for writer in _writers(trainer):
+        writer.add_image(tag, sheet, trainer.global_step, dataformats="HWC")
+
+
 def _add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:
     colors = None
     if meshes.textures is not None and hasattr(meshes.textures, "verts_features_padded"):
@@ -471,4 +415,6 @@ def _spread(items: list[Any], count: int) -> list[Any]:
     """At most `count` items, evenly spread, first and last among them."""
     if len(items) <= count:
         return items
+    if count < 2:
+        return items[:count]
     return [items[round(index * (len(items) - 1) / (count - 1))] for index in range(count)]

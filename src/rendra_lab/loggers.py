@@ -58,6 +58,18 @@ class TensorBoard(Logger):
             self.experiment.file_writer.add_summary(summary)
 
     @rank_zero_only
+    def log_gif(self, tag: str, path: Path, step: int) -> None:
+        """Shows a GIF file among the images, where it moves."""
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        with Image.open(path) as image:
+            width, height = image.size
+        content = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
+        summary = Summary(value=[Summary.Value(tag=tag, image=content)])
+        self.experiment.file_writer.add_summary(summary, step)
+
+    @rank_zero_only
     def finalize(self, status: str) -> None:
         """Brings everything to disk; writing may go on."""
         if self._writer is not None:

@@ -44,6 +44,12 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         table.writerows(rows)
 
 
+def say(line: str) -> None:
+    """One line for whoever watches a run, at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def versions() -> dict[str, str | None]:
     """The versions of Python and of the packages that numbers depend on; None for a missing one."""
     found: dict[str, str | None] = {"python": platform.python_version()}

@@ -18,10 +18,9 @@ from rendra_lab import losses, metrics
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import (
     AnimationWriter,
+    BatchReport,
     ImageLogger,
     MeshLogger,
-    Progress,
-    SequenceReport,
     StepTimer,
     StopWhenSettled,
 )
@@ -76,14 +75,6 @@ def test_a_task_that_draws_nothing_leaves_no_files(tmp_path: Path) -> None:
     mute = Mute(losses={"t": LossTerm(losses.SquaredError())}, optimizer=partial(torch.optim.SGD, lr=0.1))
     fit(ImageLogger(str(tmp_path)), AnimationWriter(str(tmp_path / "fit.gif")), steps=3, task=mute)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_progress_is_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    fit(Progress(line_s=0.0), steps=3, enable_progress_bar=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3
-    assert lines[-1].startswith("step 3/3  ")
-    assert "loss_texture" in lines[-1]
 
 
 def test_the_table_grows_columns_and_continues(tmp_path: Path) -> None:
@@ -144,7 +135,11 @@ def test_a_report_scores_no_batch_twice(tmp_path: Path) -> None:
         metrics={"seen": MetricTerm(BatchCounter()), "psnr": MetricTerm(metrics.psnr)},
     )
     silent = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
-    trainer = Trainer(accelerator="cpu", callbacks=[SequenceReport(str(tmp_path))], **silent)
+    trainer = Trainer(
+        accelerator="cpu",
+        callbacks=[BatchReport(str(tmp_path / "frames.csv"), str(tmp_path / "sequence.gif"))],
+        **silent,
+    )
     trainer.test(toy, datamodule=ToyData(), verbose=False)
     assert trainer.callback_metrics["test/seen"] == 1
     row = next(csv.DictReader((tmp_path / "frames.csv").read_text().splitlines()))

@@ -278,6 +278,11 @@ class SceneViews(LightningDataModule, ABC):
         """Makes the rays of this scene."""
         return RayCaster(self.scene.box, self.scene.depth_range, self.background, self.rays_per_pixel_side)
 
+    @property
+    def test_labels(self) -> tuple[str, ...]:
+        """What each test image is called."""
+        return self.scene.test.labels
+
     def train_dataloader(self) -> RandomPixels:
         """Random pixels of the training images."""
         return RandomPixels(self.caster, self.scene.train, self.pixels_per_step, self.steps, self.seed, **self.how)

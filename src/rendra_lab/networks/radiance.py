@@ -9,9 +9,12 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from rendra_lab.data.ray_views import RayBatch
+from rendra_lab.normal_maps import normals_from_depth
 from rendra_lab.records import TensorRecord
+from rendra_lab.visualization import depth_image, normal_image
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,20 @@ def _over_background(rgb: Tensor, opacity: Tensor, batch: RayBatch) -> Tensor:
 
 
 def view_panels(prediction: RadiancePrediction, batch: RayBatch) -> dict[str, Tensor]:
-    """A whole view, its rendering, and where they differ; nothing of a batch of single pixels."""
+    """A whole view, its rendering, where they differ, depth and normals; nothing of a batch of single pixels."""
     if batch.rgb.ndim != 4:
         return {}
     error = (prediction.rgb - batch.rgb).abs().mean(-1)
-    return {"target": batch.rgb, "rendering": prediction.rgb, "error x 4": (4 * error).clamp(max=1)[..., None]}
+    return {
+        "target": batch.rgb,
+        "rendering": prediction.rgb,
+        "error x 4": (4 * error).clamp(max=1)[..., None],
+        "depth": depth_image(prediction.depth, prediction.opacity),
+        "normals": normal_image(view_normals(prediction, batch)),
+    }
+
+
+def view_normals(prediction: RadiancePrediction, batch: RayBatch) -> Tensor:
+    """Normals (H, W, 3) of a whole view in its camera's axes, see `normals_from_depth`."""
+    directions = functional.normalize(batch.directions[0].mean(-2), dim=-1)
+    return normals_from_depth(directions, prediction.depth[0], prediction.opacity[0])
