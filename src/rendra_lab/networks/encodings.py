@@ -5,11 +5,14 @@ Points lie in [0, 1]^3; who calls maps a scene there. Every module has a `width`
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rendra.kernels.encode_grid import encode_grid, grid_offsets, grid_resolutions
+from rendra.kernels.encode_grid import COMBINATIONS, encode_grid, encode_planes, grid_offsets, grid_resolutions
 
 
 class HashGrid(nn.Module):
@@ -53,3 +56,90 @@ class HashGrid(nn.Module):
         """Resolutions and size, for `print`."""
         rows, features = self.table.shape
         return f"resolutions={self.resolutions}, rows={rows}, features={features}"
+
+
+class TriPlane(nn.Module):
+    """Three planes of features at each of a few resolutions; the resolutions stand side by side.
+
+    Fridovich-Keil et al., "K-Planes: explicit radiance fields in space, time, and appearance", CVPR 2023, without
+    its planes of time. Planes that are multiplied start uniform in 0.1..0.5, as there: near zero, a product would
+    have no gradient to leave it. Others start uniform in +-0.1.
+
+    Args:
+        resolutions: vertices along a side of the planes.
+        features: numbers a plane gives.
+        combine: how the three planes of a resolution become one: product, sum or concat.
+
+    Raises:
+        ValueError: a size or combination that cannot be.
+    """
+
+    def __init__(self, resolutions: Sequence[int] = (64, 128), features: int = 8, combine: str = "product") -> None:
+        super().__init__()
+        if not resolutions or min(resolutions) < 2 or features < 1:
+            raise ValueError(
+                "tri-planes need one or more resolutions of at least 2 vertices and at least one feature, got "
+                f"resolutions={tuple(resolutions)}, features={features}"
+            )
+        if combine not in COMBINATIONS:
+            raise ValueError(f"combine must be one of {', '.join(COMBINATIONS)}, got {combine!r}")
+        low, high = (0.1, 0.5) if combine == "product" else (-0.1, 0.1)
+        self.planes = nn.ParameterList(
+            torch.empty(3, side, side, features).uniform_(low, high) for side in resolutions
+        )
+        self.combine = combine
+        self.width = len(resolutions) * features * (3 if combine == "concat" else 1)
+
+    def forward(self, points: Float[Tensor, "M 3"]) -> Float[Tensor, "M D"]:
+        """Features of points in [0, 1]^3; those outside are clamped to the cube."""
+        return torch.cat([encode_planes(points, planes, self.combine) for planes in self.planes], 1)
+
+
+class SphericalHarmonics(nn.Module):
+    """Real spherical harmonics of unit directions, orthonormal on the sphere; m runs from -l to l in each band l.
+
+        Y_lm = sqrt((2 l + 1) / (4 pi) (l - |m|)! / (l + |m|)!) P_l^|m|(z) * (sqrt(2) cos(m phi) for m > 0, 1 for 0,
+        sqrt(2) sin(|m| phi) for m < 0)
+
+    without the Condon-Shortley sign, written as polynomials of x, y, z (Sloan, "Stupid spherical harmonics tricks",
+    GDC 2008, appendix A2). Directions of another length are not normalised.
+
+    Args:
+        bands: bands l = 0 .. bands - 1, 1 to 4 of them: bands^2 numbers.
+
+    Raises:
+        ValueError: bands not in 1..4.
+    """
+
+    def __init__(self, bands: int = 4) -> None:
+        super().__init__()
+        if not 1 <= bands <= 4:
+            raise ValueError(f"spherical harmonics are there for 1 to 4 bands, got {bands}")
+        self.bands = bands
+        self.width = bands**2
+
+    def forward(self, directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M D"]:
+        """Values of unit directions."""
+        x, y, z = directions.unbind(-1)
+        zz, across = z * z, x * x - y * y
+        values = [
+            _norm(1, 4) * torch.ones_like(x),
+            *(_norm(3, 4) * axis for axis in (y, z, x)),
+            _norm(15, 4) * x * y,
+            _norm(15, 4) * y * z,
+            _norm(5, 16) * (3 * zz - 1),
+            _norm(15, 4) * x * z,
+            _norm(15, 16) * across,
+            _norm(35, 32) * y * (3 * x * x - y * y),
+            _norm(105, 4) * x * y * z,
+            _norm(21, 32) * y * (5 * zz - 1),
+            _norm(7, 16) * z * (5 * zz - 3),
+            _norm(21, 32) * x * (5 * zz - 1),
+            _norm(105, 16) * z * across,
+            _norm(35, 32) * x * (x * x - 3 * y * y),
+        ]
+        return torch.stack(values[: self.width], -1)
+
+
+def _norm(numerator: int, denominator: int) -> float:
+    return math.sqrt(numerator / (denominator * math.pi))

@@ -100,109 +100,113 @@ def _cells(xs, ys, zs, first, count, resolution, size, base, features, rows, wei
         _hashed_cells(xs, ys, zs, first, count, resolution, size, base, features, rows, weights)
 
 
-def _gatherers(corners):
-    """Weighted sums over the corners of one, two or four features."""
-
-    @scalar_kernel
-    def one(table, rows, weights, count, f, out, place, stride):
-        for i in range(count):
-            total = _ZERO
-            for c in range(corners):
-                total += weights[c * _BLOCK + i] * table[np.uint64(rows[c * _BLOCK + i]) + np.uint64(f)]
-            out[place + i * stride] = total
-
-    @scalar_kernel
-    def two(table, rows, weights, count, f, out, place, stride):
-        for i in range(count):
-            p = q = _ZERO
-            for c in range(corners):
-                row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
-                p += w * table[row]
-                q += w * table[row + np.uint64(1)]
-            out[place + i * stride], out[place + i * stride + 1] = p, q
-
-    @scalar_kernel
-    def four(table, rows, weights, count, f, out, place, stride):
-        for i in range(count):
-            p = q = r = s = _ZERO
-            for c in range(corners):
-                row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
-                p += w * table[row]
-                q += w * table[row + np.uint64(1)]
-                r += w * table[row + np.uint64(2)]
-                s += w * table[row + np.uint64(3)]
-            o = place + i * stride
-            out[o], out[o + 1], out[o + 2], out[o + 3] = p, q, r, s
-
-    return one, two, four
-
-
-def _scatterers(corners):
-    """The transposes: what is upstream of a point is added to its corners, point after point."""
-
-    @scalar_kernel
-    def one(grad, rows, weights, count, f, upstream, place, stride):
-        for i in range(count):
-            p = upstream[place + i * stride]
-            for c in range(corners):
-                grad[np.uint64(rows[c * _BLOCK + i]) + np.uint64(f)] += weights[c * _BLOCK + i] * p
-
-    @scalar_kernel
-    def two(grad, rows, weights, count, f, upstream, place, stride):
-        for i in range(count):
-            p, q = upstream[place + i * stride], upstream[place + i * stride + 1]
-            for c in range(corners):
-                row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
-                a, b = grad[row] + w * p, grad[row + np.uint64(1)] + w * q
-                grad[row], grad[row + np.uint64(1)] = a, b
-
-    @scalar_kernel
-    def four(grad, rows, weights, count, f, upstream, place, stride):
-        for i in range(count):
-            o = place + i * stride
-            p, q, r, s = upstream[o], upstream[o + 1], upstream[o + 2], upstream[o + 3]
-            for c in range(corners):
-                row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
-                a, b = grad[row] + w * p, grad[row + np.uint64(1)] + w * q
-                d, e = grad[row + np.uint64(2)] + w * r, grad[row + np.uint64(3)] + w * s
-                grad[row], grad[row + np.uint64(1)] = a, b
-                grad[row + np.uint64(2)], grad[row + np.uint64(3)] = d, e
-
-    return one, two, four
-
-
-_gather_cell_1, _gather_cell_2, _gather_cell_4 = _gatherers(8)
-_scatter_cell_1, _scatter_cell_2, _scatter_cell_4 = _scatterers(8)
+@scalar_kernel
+def _gather_1(corners, table, rows, weights, count, f, out, place, stride):
+    for i in range(count):
+        p = _ZERO
+        for c in range(corners):
+            p += weights[c * _BLOCK + i] * table[np.uint64(rows[c * _BLOCK + i]) + np.uint64(f)]
+        out[place + i * stride] = p
 
 
 @scalar_kernel
-def _gather_cell(table, rows, weights, count, features, out, place, stride):
+def _gather_2(corners, table, rows, weights, count, f, out, place, stride):
+    for i in range(count):
+        p = q = _ZERO
+        for c in range(corners):
+            row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
+            p += w * table[row]
+            q += w * table[row + np.uint64(1)]
+        out[place + i * stride], out[place + i * stride + 1] = p, q
+
+
+@scalar_kernel
+def _gather_4(corners, table, rows, weights, count, f, out, place, stride):
+    for i in range(count):
+        p = q = r = s = _ZERO
+        for c in range(corners):
+            row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
+            p += w * table[row]
+            q += w * table[row + np.uint64(1)]
+            r += w * table[row + np.uint64(2)]
+            s += w * table[row + np.uint64(3)]
+        o = place + i * stride
+        out[o], out[o + 1], out[o + 2], out[o + 3] = p, q, r, s
+
+
+@scalar_kernel
+def _gather(corners, table, rows, weights, count, features, out, place, stride):
+    """Weighted sums over the corners of a block, `features` numbers a point, at place + i * stride."""
     f = 0
     while f < features:
         if features - f >= 4:
-            _gather_cell_4(table, rows, weights, count, f, out, place + f, stride)
+            _gather_4(corners, table, rows, weights, count, f, out, place + f, stride)
             f += 4
         elif features - f >= 2:
-            _gather_cell_2(table, rows, weights, count, f, out, place + f, stride)
+            _gather_2(corners, table, rows, weights, count, f, out, place + f, stride)
             f += 2
         else:
-            _gather_cell_1(table, rows, weights, count, f, out, place + f, stride)
+            _gather_1(corners, table, rows, weights, count, f, out, place + f, stride)
             f += 1
 
 
 @scalar_kernel
-def _scatter_cell(grad, rows, weights, count, features, upstream, place, stride):
+def _scatter_1(corners, grad, rows, weights, count, f, upstream, place, stride):
+    for i in range(count):
+        p = upstream[place + i * stride]
+        for c in range(corners):
+            grad[np.uint64(rows[c * _BLOCK + i]) + np.uint64(f)] += weights[c * _BLOCK + i] * p
+
+
+@scalar_kernel
+def _scatter_2(corners, grad, rows, weights, count, f, upstream, place, stride):
+    for i in range(count):
+        p, q = upstream[place + i * stride], upstream[place + i * stride + 1]
+        for c in range(corners):
+            row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
+            a, b = grad[row] + w * p, grad[row + np.uint64(1)] + w * q
+            grad[row], grad[row + np.uint64(1)] = a, b
+
+
+@scalar_kernel
+def _scatter_4(corners, grad, rows, weights, count, f, upstream, place, stride):
+    for i in range(count):
+        o = place + i * stride
+        p, q, r, s = upstream[o], upstream[o + 1], upstream[o + 2], upstream[o + 3]
+        for c in range(corners):
+            row, w = np.uint64(rows[c * _BLOCK + i]) + np.uint64(f), weights[c * _BLOCK + i]
+            a, b = grad[row] + w * p, grad[row + np.uint64(1)] + w * q
+            d, e = grad[row + np.uint64(2)] + w * r, grad[row + np.uint64(3)] + w * s
+            grad[row], grad[row + np.uint64(1)] = a, b
+            grad[row + np.uint64(2)], grad[row + np.uint64(3)] = d, e
+
+
+@scalar_kernel
+def _scatter(corners, grad, rows, weights, count, features, upstream, place, stride):
+    """The transpose of `_gather`: what is upstream of a point is added to its corners, point after point."""
     f = 0
     while f < features:
         if features - f >= 4:
-            _scatter_cell_4(grad, rows, weights, count, f, upstream, place + f, stride)
+            _scatter_4(corners, grad, rows, weights, count, f, upstream, place + f, stride)
             f += 4
         elif features - f >= 2:
-            _scatter_cell_2(grad, rows, weights, count, f, upstream, place + f, stride)
+            _scatter_2(corners, grad, rows, weights, count, f, upstream, place + f, stride)
             f += 2
         else:
-            _scatter_cell_1(grad, rows, weights, count, f, upstream, place + f, stride)
+            _scatter_1(corners, grad, rows, weights, count, f, upstream, place + f, stride)
             f += 1
+
+
+@scalar_kernel
+def _project(corners, table, rows, count, features, upstream, place, stride, dots):
+    """What is upstream of a point times the features of each of its corners: corner c at c * _BLOCK + i."""
+    for c in range(corners):
+        for i in range(count):
+            row, o = np.uint64(rows[c * _BLOCK + i]), place + i * stride
+            total = upstream[o] * table[row]
+            for f in range(1, features):
+                total += upstream[o + f] * table[row + np.uint64(f)]
+            dots[c * _BLOCK + i] = total
 
 
 @parallel_kernel
@@ -223,7 +227,7 @@ def encode_grid(points, table, resolutions, offsets, features, out):
                 count = min(_BLOCK, size - first)
                 _cells(xs, ys, zs, first, count, resolutions[level], held, base, features, rows, weights)
                 place = (start + first) * stride + level * features
-                _gather_cell(table, rows, weights, count, features, out, place, stride)
+                _gather(8, table, rows, weights, count, features, out, place, stride)
 
 
 @parallel_kernel
@@ -251,18 +255,7 @@ def table_gradient(points, resolutions, offsets, features, upstream, shares, gra
                     count = min(_BLOCK, size - first)
                     _cells(xs, ys, zs, first, count, resolutions[level], held, base, features, rows, weights)
                     place = (start + first) * stride + level * features
-                    _scatter_cell(grad, rows, weights, count, features, upstream, place, stride)
-
-
-@scalar_kernel
-def _project_corners(corners, table, rows, count, features, upstream, place, stride, dots):
-    """What is upstream of a point times the features of each of its corners: corner c at c * _BLOCK + i."""
-    for c in range(corners):
-        for i in range(count):
-            row, o, total = np.uint64(rows[c * _BLOCK + i]), place + i * stride, _ZERO
-            for f in range(features):
-                total += upstream[o + f] * table[row + np.uint64(f)]
-            dots[c * _BLOCK + i] = total
+                    _scatter(8, grad, rows, weights, count, features, upstream, place, stride)
 
 
 @scalar_kernel
@@ -315,6 +308,134 @@ def points_gradient(points, table, resolutions, offsets, features, upstream, gra
                 count = min(_BLOCK, size - first)
                 _cells(xs, ys, zs, first, count, resolutions[level], held, base, features, rows, weights)
                 place = (start + first) * stride + level * features
-                _project_corners(8, table, rows, count, features, upstream, place, stride, dots)
+                _project(8, table, rows, count, features, upstream, place, stride, dots)
                 _differentiate_cell(xs, ys, zs, first, count, resolutions[level], dots, grads)
+        _write_gradient(points, start, size, grads, grad)
+
+
+@scalar_kernel
+def _plane_axes(plane):
+    """Planes of (x, y), (x, z), (y, z): the coordinate along a row, and that from row to row."""
+    return (0 if plane < 2 else 1), (1 if plane < 1 else 2)
+
+
+@scalar_kernel
+def _plane_cells(us, vs, first, count, side, base, features, rows, weights):
+    """Corners in a plane of side^2 rows; bit 0 of a corner's number is its step along u, bit 1 along v."""
+    scale, last = np.float32(side - 1), np.float32(side - 2)
+    step_u, step_v, start = np.uint32(features), np.uint32(features * side), np.uint32(base)
+    for i in range(count):
+        u, v = us[first + i] * scale, vs[first + i] * scale
+        cell_u, cell_v = np.int32(u if u < last else last), np.int32(v if v < last else last)
+        u -= np.float32(cell_u)
+        v -= np.float32(cell_v)
+        weights[i] = (_ONE - u) * (_ONE - v)
+        weights[_BLOCK + i] = u * (_ONE - v)
+        weights[2 * _BLOCK + i] = (_ONE - u) * v
+        weights[3 * _BLOCK + i] = u * v
+        row = np.uint32(start + np.uint32(np.uint32(cell_u) * step_u) + np.uint32(np.uint32(cell_v) * step_v))
+        rows[i] = row
+        rows[_BLOCK + i] = np.uint32(row + step_u)
+        rows[2 * _BLOCK + i] = np.uint32(row + step_v)
+        rows[3 * _BLOCK + i] = np.uint32(row + step_u + step_v)
+
+
+@parallel_kernel
+def sample_planes(points, planes, side, features, out):
+    """The three planes' features of each point side by side. Chunks of points are owned by threads."""
+    total, stride = len(points) // 3, 3 * features
+    for chunk in prange((total + _CHUNK - 1) // _CHUNK):
+        start = chunk * _CHUNK
+        size = min(_CHUNK, total - start)
+        us, vs = np.empty(size, np.float32), np.empty(size, np.float32)
+        rows, weights = np.empty(4 * _BLOCK, np.uint32), np.empty(4 * _BLOCK, np.float32)
+        for plane in range(3):
+            axis_u, axis_v = _plane_axes(plane)
+            _axis(points, start, size, axis_u, us)
+            _axis(points, start, size, axis_v, vs)
+            for first in range(0, size, _BLOCK):
+                count = min(_BLOCK, size - first)
+                _plane_cells(us, vs, first, count, side, plane * side * side * features, features, rows, weights)
+                place = (start + first) * stride + plane * features
+                _gather(4, planes, rows, weights, count, features, out, place, stride)
+
+
+@parallel_kernel
+def multiply_planes(values, features, out):
+    """Product of the three planes' features, point by point."""
+    for point in prange(len(out) // features):
+        i, o = 3 * features * point, features * point
+        for f in range(features):
+            out[o + f] = values[i + f] * values[i + features + f] * values[i + 2 * features + f]
+
+
+@parallel_kernel
+def multiply_planes_gradient(values, features, upstream, grad):
+    """What is upstream of each plane: the product's gradient times the features of the other two."""
+    for point in prange(len(upstream) // features):
+        i, o = 3 * features * point, features * point
+        for f in range(features):
+            a, b, c = values[i + f], values[i + features + f], values[i + 2 * features + f]
+            g = upstream[o + f]
+            grad[i + f], grad[i + features + f], grad[i + 2 * features + f] = g * b * c, g * a * c, g * a * b
+
+
+@parallel_kernel
+def planes_gradient(points, side, features, upstream, grad):
+    """Four features of one plane are owned by a thread."""
+    total, stride, groups = len(points) // 3, 3 * features, (features + 3) // 4
+    for item in prange(3 * groups):
+        plane, f = item // groups, item % groups * 4
+        width, base = min(4, features - f), plane * side * side * features
+        us, vs = np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32)
+        rows, weights = np.empty(4 * _BLOCK, np.uint32), np.empty(4 * _BLOCK, np.float32)
+        for row in range(side * side):
+            for k in range(f, f + width):
+                grad[base + row * features + k] = _ZERO
+        axis_u, axis_v = _plane_axes(plane)
+        for start in range(0, total, _CHUNK):
+            size = min(_CHUNK, total - start)
+            _axis(points, start, size, axis_u, us)
+            _axis(points, start, size, axis_v, vs)
+            for first in range(0, size, _BLOCK):
+                count = min(_BLOCK, size - first)
+                _plane_cells(us, vs, first, count, side, base + f, features, rows, weights)
+                place = (start + first) * stride + plane * features + f
+                _scatter(4, grad, rows, weights, count, width, upstream, place, stride)
+
+
+@scalar_kernel
+def _differentiate_plane(us, vs, first, count, side, dots, place_u, place_v, grads):
+    """Derivative of the bilinear interpolation of four numbers, added to grads[place + i]."""
+    scale, last = np.float32(side - 1), np.float32(side - 2)
+    for i in range(count):
+        u, v = us[first + i] * scale, vs[first + i] * scale
+        u -= np.float32(np.int32(u if u < last else last))
+        v -= np.float32(np.int32(v if v < last else last))
+        d0, d1, d2, d3 = dots[i], dots[_BLOCK + i], dots[2 * _BLOCK + i], dots[3 * _BLOCK + i]
+        grads[place_u + i] += scale * ((d1 - d0) + v * ((d3 - d2) - (d1 - d0)))
+        grads[place_v + i] += scale * ((d2 - d0) + u * ((d3 - d1) - (d2 - d0)))
+
+
+@parallel_kernel
+def planes_points_gradient(points, planes, side, features, upstream, grad):
+    """Chunks of points are owned by threads, as forward."""
+    total, stride = len(points) // 3, 3 * features
+    for chunk in prange((total + _CHUNK - 1) // _CHUNK):
+        start = chunk * _CHUNK
+        size = min(_CHUNK, total - start)
+        us, vs = np.empty(size, np.float32), np.empty(size, np.float32)
+        rows, weights = np.empty(4 * _BLOCK, np.uint32), np.empty(4 * _BLOCK, np.float32)
+        dots, grads = np.empty(4 * _BLOCK, np.float32), np.zeros(3 * _CHUNK, np.float32)
+        for plane in range(3):
+            axis_u, axis_v = _plane_axes(plane)
+            _axis(points, start, size, axis_u, us)
+            _axis(points, start, size, axis_v, vs)
+            for first in range(0, size, _BLOCK):
+                count = min(_BLOCK, size - first)
+                _plane_cells(us, vs, first, count, side, plane * side * side * features, features, rows, weights)
+                place = (start + first) * stride + plane * features
+                _project(4, planes, rows, count, features, upstream, place, stride, dots)
+                at_u, at_v = axis_u * _CHUNK + first, axis_v * _CHUNK + first
+                _differentiate_plane(us, vs, first, count, side, dots, at_u, at_v, grads)
         _write_gradient(points, start, size, grads, grad)
