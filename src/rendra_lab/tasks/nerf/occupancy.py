@@ -1,0 +1,138 @@
+"""The renderer that skips what is empty and what is hidden.
+
+Mueller et al., "Instant neural graphics primitives", SIGGRAPH 2022 (occupancy); Li et al., "NerfAcc", ICCV 2023.
+Letters: Q rays, M samples of all of them; D H W cells along z, y, x.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rendra.kernels.composite import compact, composite_alphas, visible
+from rendra.kernels.occupancy import dilate, traverse
+from rendra_lab.data.ray_views import Scene
+from rendra_lab.data.scene_box import carve
+from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.tasks.nerf.fields import RadianceField
+from rendra_lab.tasks.nerf.renderers import RayRenderer
+
+_POINTS_AT_ONCE = 2**18
+
+
+class OccupancyRenderer(RayRenderer):
+    """Samples of equal length in the cells that are not empty, as far as light reaches.
+
+    A first look without gradients finds the samples that light reaches; these alone are asked for colour. Cells start
+    as the visual hull of the silhouettes, where images have them, and are looked at again in the course of training.
+
+    Args:
+        field: see `RayRenderer`.
+        cells: along the longest side of the scene's box.
+        steps_across: samples along that side.
+        refresh_every: steps between two looks at the cells.
+        empty_below: a cell is empty where the opacity of a sample in it, the largest of late, is less.
+        decay: of that largest opacity from look to look.
+        stop_below: samples before which less light than this is left are hidden.
+        jitter: shift the samples of a ray at random in training.
+        rays_at_once: see `RayRenderer`.
+    """
+
+    occupied: Tensor  # (D, H, W) bool
+    hull: Tensor  # (D, H, W) bool: outside it there is nothing, ever
+    opacities: Tensor  # (D, H, W) the largest of late
+    is_placed: Tensor
+
+    def __init__(
+        self,
+        field: RadianceField,
+        cells: int = 64,
+        steps_across: int = 256,
+        refresh_every: int = 16,
+        empty_below: float = 0.01,
+        decay: float = 0.8,
+        stop_below: float = 1e-3,
+        jitter: bool = True,
+        rays_at_once: int = 16384,
+    ) -> None:
+        super().__init__(field, rays_at_once)
+        if min(cells, steps_across, refresh_every) < 1:
+            raise ValueError("sampler.cells, sampler.steps_across and sampler.refresh_every must be at least 1")
+        self.cells = cells
+        self.steps_across = steps_across
+        self.refresh_every = refresh_every
+        self.empty_below = empty_below
+        self.decay = decay
+        self.stop_below = stop_below
+        self.jitter = jitter
+        for name in ("occupied", "hull"):
+            self.register_buffer(name, torch.ones(1, 1, 1, dtype=torch.bool))
+        self.register_buffer("opacities", torch.ones(1, 1, 1))
+        self.register_buffer("is_placed", torch.tensor(False))
+
+    def place(self, scene: Scene) -> None:
+        """Lay the cells into the box of a scene; only the visual hull may hold anything."""
+        if bool(self.is_placed):
+            return
+        super().place(scene)
+        sides = scene.box[1] - scene.box[0]
+        x, y, z = (max(1, round(self.cells * float(side / sides.amax()))) for side in sides)
+        self.hull = carve(scene.train, scene.box.cpu(), (z, y, x)).to(self.hull.device)
+        self.occupied = self.hull.clone()
+        self.opacities = self.hull.to(self.opacities.dtype)
+        self.is_placed.fill_(True)
+
+    @torch.no_grad()
+    def refresh(self, step: int) -> None:
+        """Look at the cells again, at a random point of each."""
+        if step == 0 or step % self.refresh_every != 0:
+            return
+        cells = self.hull.nonzero()  # (P, 3) zyx
+        size = torch.tensor(self.hull.shape, device=cells.device)
+        low, high = self.field.box
+        points = low + (cells + torch.rand(cells.shape, device=cells.device)).flip(1) / size.flip(0) * (high - low)
+        length = points.new_full((len(points),), self.step_length)
+        pieces = zip(points.split(_POINTS_AT_ONCE), length.split(_POINTS_AT_ONCE), strict=True)
+        found = torch.cat([self.field.opacity(*piece) for piece in pieces])
+        self.opacities[self.hull] = torch.maximum(found, self.decay * self.opacities[self.hull])
+        self.occupied = dilate(self.opacities > self.empty_below) & self.hull
+
+    @property
+    def step_length(self) -> float:
+        """Of a sample, in world units."""
+        return float((self.field.box[1] - self.field.box[0]).amax()) / self.steps_across
+
+    def render(self, rays: Rays) -> RaysSeen:
+        """What rays see."""
+        offset = (
+            torch.rand_like(rays.nearest) if self.jitter and self.training else torch.full_like(rays.nearest, 0.5)
+        )
+        samples = traverse(
+            rays.origins, rays.directions, rays.nearest, rays.farthest, self.occupied, self.field.box,
+            self.step_length, offset,
+        )  # fmt: skip
+        points, middles, lengths = self._points(rays, samples.starts, samples.ends, samples.ray_index)
+        with torch.no_grad():
+            seen = visible(self.field.opacity(points, lengths), samples.ray_first, self.stop_below)
+        kept, ray_first = compact(seen, samples.ray_first)
+        ray_index = samples.ray_index.index_select(0, kept)
+        points, middles, lengths = (values.index_select(0, kept) for values in (points, middles, lengths))
+        alphas, rgb = self.field(points, rays.directions, lengths, ray_index)
+        light = composite_alphas(alphas, rgb, middles, ray_first)
+        return RaysSeen(light.features, light.opacity, light.depth)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Torch's hook: takes on the sizes that a checkpoint has."""
+        for name in ("occupied", "hull", "opacities"):
+            if prefix + name in state_dict:
+                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.hull.device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    @staticmethod
+    def _points(rays: Rays, starts: Tensor, ends: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The middles of samples: points (M, 3) and distances (M,); and the samples' lengths (M,)."""
+        middles = (starts + ends) / 2
+        origins, directions = (rows.index_select(0, ray_index) for rows in (rays.origins, rays.directions))
+        return origins + middles[:, None] * directions, middles, ends - starts
