@@ -40,6 +40,7 @@ from rendra.renderer.implicit import (
     RayBundle,
     VolumeRenderer,
     VolumeSampler,
+    opacity_from_density,
     ray_bundle_to_ray_points,
     ray_bundle_variables_to_ray_points,
 )
@@ -155,6 +156,7 @@ __all__ = [
     "look_at_view_transform",
     "ndc_grid_sample",
     "ndc_to_grid_sample_coords",
+    "opacity_from_density",
     "opencv_from_cameras",
     "opengl_from_cameras",
     "phong_shading",

@@ -28,7 +28,9 @@ def _packed(builder, values):
 
 def _lanes_of(context, builder, kind, vector):
     """A vector as a tuple of the type `kind`."""
-    return context.make_tuple(builder, kind, [builder.extract_element(vector, ir.IntType(32)(i)) for i in range(len(kind))])
+    return context.make_tuple(
+        builder, kind, [builder.extract_element(vector, ir.IntType(32)(i)) for i in range(len(kind))]
+    )
 
 
 def _vector_of(builder, kind, lanes):

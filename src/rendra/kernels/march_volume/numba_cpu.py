@@ -136,7 +136,9 @@ def _look(inputs, m, settings, lanes, cell):
 
 
 @parallel_kernel
-def _march_back(grid, rays, occupancy, settings, lanes, cells, upstream, of_scalars, asked, steps, pieces, trails, grad):
+def _march_back(
+    grid, rays, occupancy, settings, lanes, cells, upstream, of_scalars, asked, steps, pieces, trails, grad
+):
     """First rays make the gradients of their samples, then slabs add up those of their voxels; chunk by chunk."""
     workers, at_once = len(cells), len(steps)
     for chunk in range(0, len(rays), at_once):

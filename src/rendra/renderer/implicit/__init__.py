@@ -1,7 +1,11 @@
 """Rays through space, what marchers make of the samples along them, and renderers of fields and volumes."""
 
 from rendra.renderer.implicit.harmonic_embedding import HarmonicEmbedding
-from rendra.renderer.implicit.raymarching import AbsorptionOnlyRaymarcher, EmissionAbsorptionRaymarcher
+from rendra.renderer.implicit.raymarching import (
+    AbsorptionOnlyRaymarcher,
+    EmissionAbsorptionRaymarcher,
+    opacity_from_density,
+)
 from rendra.renderer.implicit.raysampling import (
     GridRaysampler,
     MonteCarloRaysampler,
@@ -31,6 +35,7 @@ __all__ = [
     "RayBundle",
     "VolumeRenderer",
     "VolumeSampler",
+    "opacity_from_density",
     "ray_bundle_to_ray_points",
     "ray_bundle_variables_to_ray_points",
 ]
