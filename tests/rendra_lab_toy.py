@@ -1,4 +1,4 @@
-"""The smallest task that uses everything: a colour fitted to an image."""
+"""The smallest tasks that use everything: a colour fitted to an image, and a ball fitted to its views."""
 
 from __future__ import annotations
 
@@ -10,11 +10,17 @@ from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
+from rendra.renderer.cameras import look_at_rotation
 from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra_lab.base_task import Task
+from rendra_lab.data.posed_images import PosedImages
+from rendra_lab.data.ray_views import RayBatch, RayCaster, Scene, SceneViews
 from rendra_lab.data.repeated import Repeated
+from rendra_lab.losses import SquaredError
+from rendra_lab.networks.radiance import RadiancePrediction, view_panels
 from rendra_lab.records import TensorRecord
+from rendra_lab.terms import LossTerm
 
 
 @dataclass(frozen=True)
@@ -74,3 +80,42 @@ class ToyData(LightningDataModule):
 
     def test_dataloader(self) -> Repeated[ToyBatch]:
         return Repeated(self.batch)
+
+
+class SphereTask(Task[RayBatch, RadiancePrediction]):
+    """A hard ball at the origin, coloured by its normals; its radius is learned."""
+
+    def __init__(self, radius: float = 0.6, **parts: Any) -> None:
+        super().__init__(**parts)
+        self.radius = nn.Parameter(torch.tensor(radius))
+
+    def predict(self, batch: RayBatch) -> RadiancePrediction:
+        along = -(batch.origins * batch.directions).sum(-1)
+        inside = self.radius**2 - (batch.origins.square().sum(-1) - along**2)
+        edge = torch.sigmoid(inside / 0.01)
+        depth = along - inside.clamp_min(1e-9).sqrt()
+        color = 0.5 + 0.5 * (batch.origins + depth[..., None] * batch.directions) / self.radius
+        opacity = edge.mean(-1)
+        rgb = (edge[..., None] * color).mean(-2) + (1 - opacity)[..., None] * batch.background
+        return RadiancePrediction(rgb, opacity, (edge * depth).sum(-1) / edge.sum(-1).clamp_min(1e-6))
+
+    def panels(self, prediction: RadiancePrediction, batch: RayBatch) -> dict[str, Tensor]:
+        return view_panels(prediction, batch)
+
+
+class SphereViews(SceneViews):
+    """Views of that ball from all around, +y up."""
+
+    def load(self) -> Scene:
+        angle = torch.arange(9) * (2 * torch.pi / 9)
+        positions = torch.stack([angle.cos() * 2, torch.ones(9), angle.sin() * 2], dim=1)
+        R = look_at_rotation(positions)
+        T = -(positions[:, None] @ R)[:, 0]
+        lens = torch.tensor([[40.0, 40.0, 16.0, 12.0]]).repeat(9, 1)
+        blank = PosedImages.gather([""] * 9, [torch.zeros(24, 32, 3, dtype=torch.uint8)] * 9, lens, R, T)
+        box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+        ball = SphereTask(losses={"rgb": LossTerm(SquaredError())}, optimizer=torch.optim.SGD)
+        caster = RayCaster(box, None)
+        images = [(ball.observe(caster.blank_view(blank, i)).rgb[0] * 255).round().byte() for i in range(9)]
+        views = PosedImages.gather([f"view_{i}.png" for i in range(9)], images, lens, R, T)
+        return Scene(views.select(range(6)), views.select([6]), views.select([7, 8]), box)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 
@@ -14,7 +13,7 @@ from rendra_lab.base_task import BaseTask
 from rendra_lab.data.ray_views import SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
-from rendra_lab.radiance_film import SHOWN, film, path_caster
+from rendra_lab.radiance_film import SHOWN, can_write_mp4, film, path_caster
 from rendra_lab.trajectories import WAYS, trajectory
 from rendra_lab.visualization import Picture, save_animation
 
@@ -76,7 +75,7 @@ class Turntable(Callback):
         height, width = cameras.sizes[0].tolist()
         speed = len(cameras) / seconds
         files = ", ".join(f"{_FILES[name]}.gif" for name in films)
-        video = "and .mp4" if _writes_video() else "; no .mp4 without the extra [view]"
+        video = "and .mp4" if can_write_mp4() else "; no .mp4 without the extra [view]"
         report.say(
             f"{len(cameras)} frames of {width}x{height} rendered in {seconds:.1f} s, {speed:.0f}/s: {files} {video}"
         )
@@ -86,12 +85,8 @@ class Turntable(Callback):
     def _write(self, trainer: Trainer, films: Mapping[str, Sequence[Picture]]) -> None:
         for name, frames in films.items():
             path = save_animation(self.folder / f"{_FILES[name]}.gif", frames, self.fps, hold_s=0)
-            if _writes_video():
+            if can_write_mp4():
                 save_animation(path.with_suffix(".mp4"), frames, self.fps, hold_s=0)
             for logger in trainer.loggers:
                 if isinstance(logger, TensorBoard):
                     logger.log_gif(f"film/{_FILES[name]}", path, trainer.global_step)
-
-
-def _writes_video() -> bool:
-    return find_spec("av") is not None

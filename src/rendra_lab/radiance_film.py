@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import torch
@@ -13,7 +17,17 @@ from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.data.ray_views import RayBatch, RayCaster, SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import RadiancePrediction, view_normals
-from rendra_lab.visualization import Picture, depth_image, depth_limits, normal_image, to_picture
+from rendra_lab.trajectories import Size, trajectory
+from rendra_lab.visualization import (
+    Picture,
+    captioned_row,
+    depth_image,
+    depth_limits,
+    normal_image,
+    save_animation,
+    save_picture,
+    to_picture,
+)
 
 SHOWN = ("rgb", "depth", "normals")
 
@@ -75,6 +89,91 @@ def film(
         limits = _limits(depths, opacities)
         frames["depth"] = [to_picture(depth_image(*seen, limits)) for seen in zip(depths, opacities, strict=True)]
     return frames
+
+
+@dataclass(frozen=True)
+class FilmOrder:
+    """What to film, and where to.
+
+    Attributes:
+        trajectory, frames, size, elevation_deg: see `rendra_lab.trajectories.trajectory`.
+        what: one of SHOWN, or all of them side by side.
+        fps: frames a second of a file.
+        output: a .gif or .mp4 file; a folder that exists for a file that is named after what it shows; any other
+            path without an ending for a folder of PNG files.
+
+    Raises:
+        UserError: a word or an ending that nothing stands for, or an MP4 without the extra [view].
+    """
+
+    output: Path
+    trajectory: str = "auto"
+    what: str = "rgb"
+    frames: int | None = None
+    size: Size = None
+    elevation_deg: float | None = None
+    fps: float = 20.0
+
+    def __post_init__(self) -> None:
+        if self.what not in (*SHOWN, "all"):
+            raise UserError(f"what must be {', '.join(SHOWN)} or all, got {self.what!r}")
+        if not self.fps > 0:
+            raise UserError(f"fps must be positive, got {self.fps!r}")
+        if self.output.suffix not in ("", ".gif", ".mp4") and not self.output.is_dir():
+            raise UserError(f"output must end in .gif or .mp4, or be a folder for PNG files; got {self.output}")
+        if self.output.suffix == ".mp4" and not can_write_mp4():
+            raise UserError("an MP4 needs a video encoder: pip install 'rendra[view]'; or choose output=NAME.gif")
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Some of SHOWN."""
+        return SHOWN if self.what == "all" else (self.what,)
+
+    def file(self) -> Path:
+        """Where the film goes: a file, or a folder for PNG files."""
+        if not self.output.is_dir():
+            return self.output
+        return self.output / f"{self.what}.{'mp4' if can_write_mp4() else 'gif'}"
+
+
+def render_run(task: Any, data: Any, order: FilmOrder) -> tuple[str, Path]:
+    """Films what a finished run has fitted.
+
+    Args:
+        task: of the run, with its weights.
+        data: of the run, set up.
+        order: what to film.
+
+    Returns:
+        One line about it, and the file or folder.
+
+    Raises:
+        UserError: the run fitted no scene of rays, or the order cannot be carried out.
+    """
+    if not isinstance(data, SceneViews):
+        raise UserError(f"run: {type(task).__name__} fits no scene that can be filmed; take a run of nerf or volume")
+    cameras = trajectory(order.trajectory, data.scene, order.frames, order.size, order.elevation_deg)
+    begun = perf_counter()
+    films = film(task, path_caster(data), cameras, order.shown)
+    seconds = perf_counter() - begun
+    rows = [dict(zip(films, row, strict=True)) for row in zip(*films.values(), strict=True)]
+    frames = [captioned_row(row) if len(row) > 1 else next(iter(row.values())) for row in rows]
+    output = order.file()
+    if output.suffix:
+        save_animation(output, frames, order.fps, hold_s=0)
+    else:
+        for index, frame in enumerate(frames):
+            save_picture(output / f"frame_{index:04d}.png", frame)
+    height, width = cameras.sizes[0].tolist()
+    return (
+        f"{len(frames)} frames of {width}x{height} rendered in {seconds:.1f} s, {len(frames) / seconds:.0f}/s",
+        output,
+    )
+
+
+def can_write_mp4() -> bool:
+    """Whether the extra [view] is there."""
+    return find_spec("av") is not None
 
 
 def _limits(depths: Sequence[Tensor], opacities: Sequence[Tensor]) -> tuple[float, float]:
