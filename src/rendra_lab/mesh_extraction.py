@@ -1,8 +1,8 @@
 """The mesh of a radiance field: its surface, without hollows and floaters, in the field's colours.
 
-The surface is where half of the light of a ray that meets it head-on is stopped (see `optical_depth`): what renderings
-show, whether the density rises to ten or to ten thousand behind it. A level of the density itself would lie outside of
-it in a dense field, and inside of it in a thin one.
+The surface is where half of the light of a ray that meets it head-on is stopped (see `optical_depth`): what
+renderings show, whether the density rises to ten or to ten thousand behind it. A level of the density itself would
+lie outside of it in a dense field, and inside of it in a thin one.
 
 A vertex has the colour of the ray that comes straight at it: the one direction that is known for every point of every
 scene, and never a grazing one, where fields are worst. A colour that changes with the viewer keeps only that one.
@@ -215,29 +215,29 @@ def _settle(mesh: Meshes, density: Density, light: LightFromOutside, level: floa
     behind = reached.to(torch.int8).argmax(1)
     settles = reached.any(1) & (behind > 0)
     before = (behind - 1).clamp_min(0)[:, None]
+    start_height, start_sigma, start_depth = (values.gather(1, before)[:, 0] for values in (heights, sigma, depth))
     height = _crossing(
-        density_along, *(values.gather(1, before)[:, 0] for values in (heights, sigma, depth)),
-        sigma.gather(1, behind[:, None])[:, 0], float(steps[0] - steps[1]), wanted,
+        density_along, start_height, start_sigma, wanted - start_depth, sigma.gather(1, behind[:, None])[:, 0],
+        float(steps[0] - steps[1]),
     )  # fmt: skip
     moved = verts + torch.where(settles, height, torch.zeros_like(height))[:, None] * normals
     return Meshes([moved], mesh.faces_list())
 
 
 def _crossing(
-    density_along: Density, height: Tensor, sigma: Tensor, depth: Tensor, end_sigma: Tensor, length: float,
-    wanted: float,
-) -> Tensor:  # fmt: skip
-    """The heights (V,) at which rays that go down from `height` reach a depth within `length`, by bisection."""
+    density_along: Density, height: Tensor, sigma: Tensor, missing: Tensor, end_sigma: Tensor, length: float
+) -> Tensor:
+    """The heights (V,) at which rays that go down from `height` gain the depth `missing` within `length`."""
     for _ in range(_BISECTIONS):
         length /= 2
         middle = density_along((height - length)[:, None])[:, 0]
-        there = depth + (sigma + middle) / 2 * length
-        beyond = there < wanted
+        left = missing - (sigma + middle) / 2 * length
+        beyond = left > 0
         height = torch.where(beyond, height - length, height)
-        depth = torch.where(beyond, there, depth)
+        missing = torch.where(beyond, left, missing)
         sigma, end_sigma = torch.where(beyond, middle, sigma), torch.where(beyond, end_sigma, middle)
     gain = (sigma + end_sigma) / 2 * length
-    return height - length * ((wanted - depth) / gain.clamp_min(1e-12)).clamp(0, 1)
+    return height - length * (missing / gain.clamp_min(1e-12)).clamp(0, 1)
 
 
 def _normals_at(mesh: Meshes, points: Tensor) -> Tensor:

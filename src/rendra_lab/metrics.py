@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rendra.ops import knn_points, sample_points_from_meshes, self_intersections
+from rendra.ops import distance_to_surface, knn_points, sample_points_from_meshes, self_intersections
 from rendra.structures import Meshes
 from rendra.transforms import so3_log_map
 from rendra_lab import losses
 
 _PSNR_CEILING_DB = 100.0  # of two equal images
 _SURFACE_SAMPLES = 10_000  # that stand for a surface
+_TRUTH_SAMPLES = 100_000  # that stand for a surface which is compared with the true one
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor) -> Tensor:
@@ -34,6 +35,19 @@ def psnr(prediction: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB for a peak of 1, the mean over images; equal images get 100 dB."""
     prediction, target = _batched(prediction, target)
     error = (prediction - target).square().flatten(1).mean(1)
+    return (-10 * error.clamp_min(10 ** (-_PSNR_CEILING_DB / 10)).log10()).mean()
+
+
+def psnr_foreground(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """`psnr` over the pixels whose mask (B, H, W) is above 0.5 alone: the squared error's mean is over those.
+
+    The mean over images; one without such pixels is left out, and NaN comes back where all are.
+    """
+    prediction, target = _batched(prediction, target)
+    inside = (mask > 0.5).reshape(len(prediction), -1).to(prediction.dtype)
+    squares = (prediction - target).square().mean(-1).flatten(1)
+    counts = inside.sum(1)
+    error = (squares * inside).sum(1)[counts > 0] / counts[counts > 0]
     return (-10 * error.clamp_min(10 ** (-_PSNR_CEILING_DB / 10)).log10()).mean()
 
 
@@ -94,6 +108,19 @@ def surface_chamfer(mesh: Meshes, points: Tensor) -> Tensor:
     return losses.chamfer(_samples(mesh), points)
 
 
+def surface_chamfer_l1(mesh: Meshes, truth: Meshes) -> Tensor:
+    """Mean distance between two surfaces, not squared, in diagonals of the true one's bounding box.
+
+    The mean of two means: of the exact distances from 100,000 points spread evenly over `mesh` to the surface
+    `truth`, and from as many of `truth` to `mesh`. The points are the same at every call. Both meshes are batches of
+    one, with faces, in the same frame.
+    """
+    low, high = truth.verts_packed().amin(0), truth.verts_packed().amax(0)
+    there = distance_to_surface(_samples(mesh, _TRUTH_SAMPLES)[0], truth).distance.mean()
+    back = distance_to_surface(_samples(truth, _TRUTH_SAMPLES)[0], mesh).distance.mean()
+    return (there + back) / 2 / (high - low).norm()
+
+
 def surface_f_score(mesh: Meshes, points: Tensor, threshold: float) -> Tensor:
     """The harmonic mean of precision and recall, in [0, 1].
 
@@ -127,10 +154,10 @@ def num_self_intersections(mesh: Meshes) -> Tensor:
     return torch.tensor(float(len(self_intersections(mesh))), device=mesh.device)
 
 
-def _samples(mesh: Meshes) -> Tensor:
-    """Points on a surface (1, 10,000, 3), the same at every call."""
+def _samples(mesh: Meshes, count: int = _SURFACE_SAMPLES) -> Tensor:
+    """Points on a surface (1, count, 3), the same at every call."""
     generator = torch.Generator(mesh.device).manual_seed(0)
-    return sample_points_from_meshes(mesh, _SURFACE_SAMPLES, generator=generator)
+    return sample_points_from_meshes(mesh, count, generator=generator)
 
 
 def _batched(prediction: Tensor, target: Tensor, dims: int = 4) -> tuple[Tensor, Tensor]:

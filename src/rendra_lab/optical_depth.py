@@ -33,7 +33,7 @@ Density = Callable[[Tensor], Tensor]
 
 
 def density_of(scene: RadianceScene, step: float) -> Density:
-    """The density (M,), 1/length, of points (M, 3): that of matter as opaque as a step of the scene; 0 out of its box.
+    """The density (M,), 1/length, of points (M, 3): of matter as opaque as a step of the scene; 0 out of its box.
 
     Args:
         scene: to ask.
