@@ -10,7 +10,6 @@ import math
 import torch
 from torch import Tensor
 
-from rendra.ops import sample_farthest_points
 from rendra.renderer.cameras import look_at_view_transform
 from rendra_lab.errors import UserError
 
@@ -66,9 +65,12 @@ def _between(train: Tensor, candidates: Tensor, count: int) -> Tensor:
     if not count:
         return candidates[:0]
     clearance = torch.cdist(candidates, train).amin(1)
-    order = clearance.argsort(descending=True, stable=True)[: max(count, len(candidates) // 5)]
-    chosen, _ = sample_farthest_points(candidates[order][None], K=count)
-    return chosen[0]
+    far = candidates[clearance.argsort(descending=True, stable=True)[: max(count, len(candidates) // 5)]]
+    chosen, gap = [0], torch.cdist(far, far[:1])[:, 0]
+    while len(chosen) < count:
+        chosen.append(int(gap.argmax()))
+        gap = gap.minimum(torch.cdist(far, far[chosen[-1:]])[:, 0])
+    return far[chosen]
 
 
 def _sphere(count: int, turn: float) -> Tensor:

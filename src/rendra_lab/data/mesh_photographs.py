@@ -123,7 +123,7 @@ class MeshPhotographer:
         image = torch.zeros(height, width, 4, device=shot.R.device)
         top, left, bottom, right = self._outline(shot)
         rows = max(1, _SAMPLES_AT_ONCE // (self.antialias**2 * max(1, right - left)))
-        for first in range(top, bottom, rows):
+        for first in range(top, bottom if left < right else top, rows):
             last = min(first + rows, bottom)
             samples = self._through_lens(shot, first, left, last, right)
             image[first:last, left:right] = _average(samples, self.antialias)
@@ -187,7 +187,7 @@ class MeshPhotographer:
 class _Shot(TensorRecord):
     R: Float[Tensor, "1 3 3"]
     T: Float[Tensor, "1 3"]
-    intrinsics: Float[Tensor, "4"]
+    intrinsics: Float[Tensor, " 4"]
     distortion: Float[Tensor, "1 8"]
     size: tuple[int, int]
 

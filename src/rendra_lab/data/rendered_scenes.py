@@ -22,12 +22,12 @@ from rendra_lab.data.camera_rigs import look_at_origin, rig
 from rendra_lab.data.mesh_photographs import MeshPhotographer, Shots
 from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.data.ray_views import Scene, SceneViews
+from rendra_lab.data.scene_box import estimate_box
 from rendra_lab.errors import UserError
 
 log = logging.getLogger(__name__)
 
 _EDITION = "1"  # of the pictures; another one makes all cached ones anew
-_MARGIN = 0.05  # of the box about the mesh, in parts of its sides
 _TEXTURE_PARTS = ("maps_padded", "faces_uvs_padded", "verts_uvs_padded", "verts_features_packed", "atlas_packed")
 _TEXTURE_MODES = ("padding_mode", "sampling_mode", "align_corners")
 
@@ -105,11 +105,12 @@ class RenderedScene(SceneViews):
         )
         self._check_visible(images)
         first, second = self.splits["train"], self.splits["train"] + self.splits["val"]
+        train = images.select(range(first))
         return Scene(
-            train=images.select(range(first)),
+            train=train,
             val=images.select(range(first, second)),
             test=images.select(range(second, len(images))),
-            box=_box_about(self.mesh),
+            box=estimate_box(train),
             truth=self.mesh,
             up=(0.0, 1.0, 0.0),
         )
@@ -207,14 +208,8 @@ def _version(package: str) -> str:
 
 
 def _checksum(pixels: Tensor) -> str:
-    return str(zlib.crc32(pixels.contiguous().numpy()))
+    return str(zlib.crc32(pixels.contiguous().numpy().data))
 
 
 def _bounds(verts: Tensor) -> tuple[Tensor, Tensor]:
     return verts.amin(0), verts.amax(0)
-
-
-def _box_about(mesh: Meshes) -> Tensor:
-    low, high = _bounds(mesh.verts_packed().detach().cpu())
-    margin = _MARGIN * (high - low).amax()
-    return torch.stack([low - margin, high + margin])

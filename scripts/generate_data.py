@@ -1,0 +1,25 @@
+"""Write posed images as a folder of a common format: `python scripts/generate_data.py --help`."""
+
+from typing import Any
+
+import hydra
+
+from rendra_lab.front_door import guarded
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="generate_data")
+def main(cfg: Any) -> None:
+    """Write what the configuration says; heavy imports wait until here, so that `--help` answers at once."""
+    from hydra.utils import instantiate
+
+    from rendra_lab.data.scene_folders import check_output, write_scene
+
+    target = (cfg.output, cfg.format, cfg.overwrite)
+    check_output(*target)
+    scene = instantiate(cfg.data, _convert_="all").load()
+    folder = write_scene(scene, *target)
+    print(f"{len(scene.train)} training, {len(scene.val)} validation and {len(scene.test)} test views\n{folder}")
+
+
+if __name__ == "__main__":
+    guarded(main, __file__, config_path="../conf", config_name="generate_data")
