@@ -38,8 +38,8 @@ def piecewise(optimizer: Optimizer, knots: Sequence[Sequence[float]]) -> LambdaL
     return LambdaLR(optimizer, PiecewiseLinear(knots))
 
 
-def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, factor: float = 0.1) -> LambdaLR:
-    """After a share `at` of the run the rate is `factor` times what it was, and the optimizer starts anew.
+def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, final_factor: float = 0.1) -> LambdaLR:
+    """After a share `at` of the run the rate is `final_factor` times what it was, and the optimizer starts anew.
 
     As if another optimizer took over: Adam's running means are forgotten.
     """
@@ -50,6 +50,6 @@ def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, factor: 
     def rate(step: int) -> float:
         if step == restart:
             optimizer.state.clear()
-        return factor if step >= restart else 1.0
+        return final_factor if step >= restart else 1.0
 
     return LambdaLR(optimizer, rate)

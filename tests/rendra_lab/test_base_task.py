@@ -102,6 +102,7 @@ def test_an_optimizer_that_needs_residuals_gets_them() -> None:
         (partial(schedulers.cosine, final_factor=0.5), 0.5),
         (partial(schedulers.cosine, final_factor=0.5, warmup_steps=2), 0.5),
         (partial(schedulers.exponential, final_factor=0.1), 0.1),
+        (partial(schedulers.restarted, final_factor=0.2), 0.2),
         (partial(torch.optim.lr_scheduler.StepLR, step_size=2, gamma=0.5), 0.25),
     ],
 )
@@ -109,6 +110,27 @@ def test_schedulers_reach_their_end_with_the_run(scheduler: Any, factor: float) 
     run = trainer(steps=4)
     run.fit(task(scheduler=scheduler), datamodule=ToyData(steps=4))
     assert run.optimizers[0].param_groups[0]["lr"] == pytest.approx(0.1 * factor)
+
+
+def test_a_restart_is_another_optimizer_taking_over() -> None:
+    x, y = (torch.nn.Parameter(torch.tensor([1.0, -2.0])) for _ in range(2))
+    restarted, other = torch.optim.Adam([x], lr=0.1), torch.optim.Adam([y], lr=0.1)
+    scheduler = schedulers.restarted(restarted, total_steps=8, at=0.5, final_factor=0.3)
+    for step in range(8):
+        if step == 4:
+            other = torch.optim.Adam([y], lr=0.03)
+        for parameter, optimizer in ((x, restarted), (y, other)):
+            optimizer.zero_grad()
+            (parameter**4).sum().backward()
+            optimizer.step()
+        scheduler.step()
+        assert torch.allclose(x, y)
+
+
+@pytest.mark.parametrize("at", [-0.1, 1.5])
+def test_a_restart_lies_within_the_run(at: float) -> None:
+    with pytest.raises(ValueError, match="share of the run"):
+        schedulers.restarted(torch.optim.Adam([torch.zeros(1)]), total_steps=8, at=at)
 
 
 def test_a_scheduler_without_an_end_is_refused() -> None:

@@ -19,6 +19,15 @@ def pair() -> tuple[torch.Tensor, torch.Tensor]:
     return (target + 0.1 * torch.randn_like(target)).clamp(0, 1), target
 
 
+def test_the_books_huber_is_its_formula(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+    squared = (pair[0] - pair[1]) ** 2
+    expected = ((((1 + squared / 0.01).clamp(1e-4)).sqrt() - 1) * 0.1).mean()
+    assert_close(losses.pseudo_huber(*pair), expected, atol=1e-12)
+    far, zero = torch.full((1,), 1e4), torch.zeros(1)
+    assert_close(losses.pseudo_huber(far, zero), far[0] - 0.1, atol=1e-2)
+    assert_close(losses.pseudo_huber(zero + 1e-4, zero), 5e-8, atol=1e-12)
+
+
 def test_psnr_is_scikit_images(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
     values = [peak_signal_noise_ratio(t.numpy(), p.numpy(), data_range=1.0) for p, t in zip(*pair, strict=True)]
     assert float(metrics.psnr(*pair)) == pytest.approx(float(np.mean(values)), abs=1e-9)
