@@ -34,7 +34,7 @@ def test_a_hash_grid_starts_near_zero():
     table = HashGrid().table
     assert table.shape[1] == 2
     assert table.abs().max() <= 1e-4
-    assert_close(table.std().item(), 1e-4 / math.sqrt(3), rtol=0.02)
+    assert table.std().item() == pytest.approx(1e-4 / math.sqrt(3), rel=0.02)
 
 
 def test_multiplied_planes_start_away_from_zero():

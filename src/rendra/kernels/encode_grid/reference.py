@@ -26,6 +26,7 @@ _PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 
 def encode_grid(points: Tensor, table: Tensor, resolutions: Sequence[int], offsets: Sequence[int]) -> Tensor:
     """Features (M, L F); see the package's `encode_grid` for the arguments."""
+    width = table.shape[1]
     sizes = [end - begin for begin, end in pairwise(offsets)]
 
     def encode(part: Tensor) -> Tensor:
@@ -35,10 +36,10 @@ def encode_grid(points: Tensor, table: Tensor, resolutions: Sequence[int], offse
             for corner in torch.cartesian_prod(*[torch.arange(2, device=part.device)] * 3):
                 rows.append(offset + _row(cell + corner, resolution, size))
                 weights.append(torch.where(corner.bool(), fraction, 1 - fraction).prod(-1))
-        found = table.index_select(0, torch.stack(rows, 1).view(-1)).view(len(part), len(sizes), 8, -1)
+        found = table.index_select(0, torch.stack(rows, 1).view(-1)).view(len(part), len(sizes), 8, width)
         return (found * torch.stack(weights, 1).view(len(part), len(sizes), 8, 1)).sum(2).flatten(1)
 
-    return _in_chunks(encode, points, 8 * len(sizes) * table.shape[1], len(sizes) * table.shape[1])
+    return _in_chunks(encode, points, 8 * len(sizes) * width)
 
 
 def encode_planes(points: Tensor, planes: Tensor, combine: str) -> Tensor:
@@ -60,7 +61,7 @@ def encode_planes(points: Tensor, planes: Tensor, combine: str) -> Tensor:
             return torch.cat(sums, 1)
         return sums[0] * sums[1] * sums[2] if combine == "product" else sums[0] + sums[1] + sums[2]
 
-    return _in_chunks(encode, points, 12 * width, 3 * width if combine == "concat" else width)
+    return _in_chunks(encode, points, 12 * width)
 
 
 def _cell(points: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
@@ -78,9 +79,7 @@ def _row(vertex: Tensor, resolution: int, size: int) -> Tensor:
     return (x * _PRIMES[0] ^ y * _PRIMES[1] ^ z * _PRIMES[2]) % size
 
 
-def _in_chunks(encode: Callable[[Tensor], Tensor], points: Tensor, lookups: int, width: int) -> Tensor:
+def _in_chunks(encode: Callable[[Tensor], Tensor], points: Tensor, lookups: int) -> Tensor:
     """`encode` of a few points after the other, each recomputed in its backward pass."""
-    if not len(points):
-        return encode(points.new_zeros(1, 3))[:0]
     parts = points.split(max(1, _LOOKUPS_AT_ONCE // lookups))
     return torch.cat([checkpoint(encode, part, use_reentrant=False) for part in parts])
