@@ -35,7 +35,8 @@ SHOWN = ("rgb", "depth", "normals")
 def path_caster(data: SceneViews) -> RayCaster:
     """Makes rays as the data does, over one background for all frames: white, where training draws it at random."""
     background = "white" if data.background == "random" else data.background
-    return RayCaster(data.scene.box, data.scene.depth_range, background, data.rays_per_pixel_side)
+    scene = data.scene
+    return RayCaster(scene.box, scene.depth_range, background, data.rays_per_pixel_side, scene.warp)
 
 
 def render_path(

@@ -6,7 +6,7 @@ Letters: K rays of a pixel; "pixels" are R chosen ones in training, and (1, H, W
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,9 @@ from rendra.structures import Meshes
 from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
+
+RayWarp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Takes rays, origins (Q, 3) and unit directions (Q, 3), to those of a bent space: the same shapes and lengths."""
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0, "random": None}
 
@@ -47,6 +50,7 @@ class Scene:
     depth_range: tuple[float, float] | None = None  # distances along a ray to look between; None: all of the box
     truth: Meshes | None = None  # the scene itself, where it is known
     up: tuple[float, float, float] | None = None  # the upward direction, where it is known
+    warp: RayWarp | None = None  # to the space in which box and depth_range are given; None: the world
 
 
 def within_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,12 +71,19 @@ class RayCaster:
         depth_range: see `Scene`.
         background: white, black or random.
         side: rays of a pixel along each of its sides; K = side * side, spread evenly over its area.
+        warp: see `Scene`.
     """
 
     def __init__(
-        self, box: Tensor, depth_range: tuple[float, float] | None, background: str = "white", side: int = 1
+        self,
+        box: Tensor,
+        depth_range: tuple[float, float] | None,
+        background: str = "white",
+        side: int = 1,
+        warp: RayWarp | None = None,
     ) -> None:
         self.box = box
+        self.warp = warp
         self.depth_range = depth_range
         self.background = background
         self.side = side
@@ -114,7 +125,8 @@ class RayCaster:
         width = images.sizes[view, 1]
         corner = torch.stack([place % width, place // width], dim=-1).float()
         xy = (corner[:, None] + self._offsets(len(place), generator)).reshape(-1, 2)
-        return images.rays(view.repeat_interleave(self.side**2), xy)
+        rays = images.rays(view.repeat_interleave(self.side**2), xy)
+        return rays if self.warp is None else self.warp(*rays)
 
     def _offsets(self, count: int, generator: torch.Generator | None) -> Tensor:
         """Where in its pixel each ray goes through: (count or 1, K, 2)."""
@@ -276,7 +288,8 @@ class SceneViews(LightningDataModule, ABC):
     @property
     def caster(self) -> RayCaster:
         """Makes the rays of this scene."""
-        return RayCaster(self.scene.box, self.scene.depth_range, self.background, self.rays_per_pixel_side)
+        scene = self.scene
+        return RayCaster(scene.box, scene.depth_range, self.background, self.rays_per_pixel_side, scene.warp)
 
     @property
     def test_labels(self) -> tuple[str, ...]:
