@@ -118,15 +118,15 @@ def _march_on_cpu(
     feature_activation: str,
     stop_below: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    results = _empty_results(grid, rays)
-    n, r = rays.shape[:2]
+    count = rays.shape[0] * rays.shape[1]
     cells = _cells(occupancy)
     settings = _settings(grid, rays, cells, num_samples, mode, density_activation, feature_activation, stop_below)
+    features, opacity, depth = _empty_results(grid, rays)
     numba_cpu.forward(
-        grid.detach().contiguous().view(-1).numpy(), rays.reshape(n * r, 9).numpy(), cells, settings,
-        grid.shape[-1], tuple(each.view(n * r, *each.shape[2:]).numpy() for each in results),
+        grid.detach().contiguous().view(-1).numpy(), rays.reshape(count, 9).numpy(), cells, settings, grid.shape[-1],
+        (features.view(count, grid.shape[-1] - 1).numpy(), opacity.view(-1).numpy(), depth.view(-1).numpy()),
     )  # fmt: skip
-    return results
+    return features, opacity, depth
 
 
 @_march_on_cpu.register_fake
@@ -191,11 +191,13 @@ def _settings(
     feature_activation: str,
     stop_below: float,
 ) -> numba_cpu.Settings:
+    depth, height, width = grid.shape[1:4]
     n, r = rays.shape[:2]
-    activations = _ACTIVATIONS.index(density_activation), _ACTIVATIONS.index(feature_activation)
+    first, rest = _ACTIVATIONS.index(density_activation), _ACTIVATIONS.index(feature_activation)
     return numba_cpu.Settings(
-        *grid.shape[1:4], *cells.shape, max(1, n * r if len(grid) == 1 else r), num_samples, mode == "density",
-        any(activations), *activations, np.float32(stop_below),
+        depth, height, width, cells.shape[0], cells.shape[1], cells.shape[2],
+        max(1, n * r if len(grid) == 1 else r), num_samples, mode == "density", first + rest > 0, first, rest,
+        np.float32(stop_below),
     )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def _splat(builder, value, count):
 
 
 def _multiply_add(builder, a, b, c):
-    """a b + c, fused where the processor can."""
+    """The vector a b + c, fused where the processor can."""
     suffix = f"v{a.type.count}f32" if isinstance(a.type, ir.VectorType) else "f32"
     signature = ir.FunctionType(a.type, [a.type] * 3)
     fused = cgutils.get_or_insert_function(builder.module, signature, f"llvm.fmuladd.{suffix}")
@@ -146,7 +146,7 @@ def store(typingctx, flat, at, lanes):
 
 @intrinsic
 def add_scaled(typingctx, total, factor, lanes):
-    """total + factor lanes."""
+    """The sum total + factor lanes."""
 
     def codegen(context, builder, signature, arguments):
         total, factor, values = arguments

@@ -204,10 +204,10 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
         left *= ONE - alpha
         k += 1
     behind = -of_scalars[2 * m]
-    for entry in range(entry - 1, -1, -1):
-        gain = trail[2 * samples + entry] - behind
-        asked[(place + entry) * count] = trail[samples + entry] * gain
-        behind += trail[entry] * gain
+    for j in range(entry - 1, -1, -1):
+        gain = trail[2 * samples + j] - behind
+        asked[(place + j) * count] = trail[samples + j] * gain
+        behind += trail[j] * gain
 
 
 @scalar_kernel

@@ -9,7 +9,8 @@ grid counting as 0. With activations only samples between the outermost centres 
     weight  w_j     a_j T_j, with T_j = prod_{k<j} (1 - a_k)             (Max, 1995; Mildenhall et al., 2020, Eq. 3)
     results         sum_j w_j f_j;  1 - prod_j (1 - a_j);  sum_j w_j t_j
 
-A sample in an empty cell of the occupancy has a_j = 0, and so has one with T_j below `stop_below`.
+A sample in an empty cell of the occupancy has a_j = 0, and so has one with T_j below `stop_below`. A ray that is not
+finite sees NaN.
 """
 
 import math
@@ -53,8 +54,8 @@ def march_volume(
             for chunk in ray_rows.split(at_once)
         ]
         parts.append(torch.cat(chunks))
-    flat = torch.cat(parts) if parts else rays.new_zeros((0, grid.shape[-1] + 1))
-    features, opacity, depth = flat.view(*rays.shape[:2], -1).tensor_split((-2, -1), dim=-1)
+    flat = torch.cat(parts) if parts else _zeros(grid, (0, grid.shape[-1] + 1))
+    features, opacity, depth = flat.view(*rays.shape[:2], grid.shape[-1] + 1).tensor_split((-2, -1), dim=-1)
     return features, opacity[..., 0], depth[..., 0]
 
 
@@ -90,7 +91,7 @@ def _march(
     alpha = torch.where(_transmittance(alpha.detach()) < stop_below, 0.0, alpha)
     weights = alpha * _transmittance(alpha)
     features = _ACTIVATIONS[activations[1]](values[..., 1:])
-    return torch.cat(
+    seen = torch.cat(
         (
             (weights[..., None] * features).sum(1),
             1 - (1 - alpha).prod(1, keepdim=True),
@@ -98,6 +99,7 @@ def _march(
         ),
         dim=1,
     )
+    return torch.where(rays.isfinite().all(1, keepdim=True), seen, torch.nan)
 
 
 def _transmittance(alpha: Tensor) -> Tensor:
@@ -107,12 +109,17 @@ def _transmittance(alpha: Tensor) -> Tensor:
 
 def _trilinear(grid: Tensor, points: Tensor) -> Tensor:
     """Values (R, S, K) at points in voxels; 0 outside."""
-    if points.numel() == 0 or grid.numel() == 0:
-        return points.new_zeros((*points.shape[:2], grid.shape[-1]))
+    if points.numel() == 0:
+        return _zeros(grid, (*points.shape[:2], grid.shape[-1]))
     places = (2 * points + 1) / (_last(grid) + 1) - 1
     planes = grid.movedim(-1, 0)[None]
     read = F.grid_sample(planes, places[None, None], "bilinear", "zeros", align_corners=False)
     return read[0, :, 0].movedim(0, -1)
+
+
+def _zeros(grid: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Zeros with a gradient for the grid, which is 0."""
+    return grid.flatten()[:0].sum().expand(shape)
 
 
 def _is_occupied(occupancy: Tensor, grid: Tensor, points: Tensor) -> Tensor:

@@ -128,17 +128,16 @@ def _march(
     count: int,
 ) -> tuple[Tensor, Tensor]:
     """Features (N, R, C) and opacity (N, R)."""
+    origins, directions = places
     sizes = volumes.locator.sizes
     if all(size == tuple(grids[0].shape[2:]) for size in sizes):
-        seen = march_volume(_interleaved(_without_copies(grids)), *places, first, step, count)
+        seen = march_volume(_interleaved(_without_copies(grids)), origins, directions, first, step, count)
         return seen.features, seen.opacity
-    parts = [
-        march_volume(
-            _interleaved([each[i : i + 1, :, :depth, :height, :width] for each in grids]),
-            *(each[i : i + 1] for each in (*places, first, step)), count,
-        )
-        for i, (depth, height, width) in enumerate(sizes)
-    ]  # fmt: skip
+    parts = []
+    for i, (depth, height, width) in enumerate(sizes):
+        own = _interleaved([each[i : i + 1, :, :depth, :height, :width] for each in grids])
+        row = slice(i, i + 1)
+        parts.append(march_volume(own, origins[row], directions[row], first[row], step[row], count))
     return torch.cat([each.features for each in parts]), torch.cat([each.opacity for each in parts])
 
 

@@ -5,7 +5,7 @@ import torch
 from assertions import assert_close, assert_finite
 from far_device import Far, far  # noqa: F401
 
-from rendra.renderer import AbsorptionOnlyRaymarcher, EmissionAbsorptionRaymarcher
+from rendra.renderer import AbsorptionOnlyRaymarcher, EmissionAbsorptionRaymarcher, opacity_from_density
 
 
 def literal(densities, features, thickness):
@@ -111,3 +111,39 @@ def test_impossible_input_is_refused(densities, features, message) -> None:
 def test_a_surface_has_a_thickness() -> None:
     with pytest.raises(ValueError, match="at least 1, got 0"):
         EmissionAbsorptionRaymarcher(surface_thickness=0)
+
+
+def test_rounding_is_not_warned_of() -> None:
+    AbsorptionOnlyRaymarcher()(torch.tensor([[1.000001], [-1e-6]]))
+
+
+def test_densities_absorb_alike_however_many_samples_there_are() -> None:
+    """1 - exp(-sigma d) over the distance d, in the world or in units of the lengths."""
+    for count in (5, 50):
+        lengths = torch.arange(count) * (2.0 / count)
+        opacity = opacity_from_density(torch.full((count, 1), 0.7), lengths, torch.tensor([0.0, 3.0, 4.0]))
+        assert_close(AbsorptionOnlyRaymarcher()(opacity), 1 - torch.tensor([-0.7 * 10]).exp())
+        opacity = opacity_from_density(torch.full((count, 1), 0.7), lengths)
+        assert_close(AbsorptionOnlyRaymarcher()(opacity), 1 - torch.tensor([-0.7 * 2]).exp())
+
+
+def test_the_step_behind_the_last_sample() -> None:
+    densities = torch.tensor([0.0, 0.5, 0.5])[:, None]
+    lengths = torch.tensor([0.0, 1.0, 3.0])
+    assert_close(opacity_from_density(densities, lengths)[:, 0], 1 - torch.tensor([0.0, -1.0, -1.0]).exp())
+    assert_close(opacity_from_density(densities, lengths, last_step=1e10)[-1], [1.0])
+    assert_close(opacity_from_density(densities[:1] + 1, lengths[:1]), [[0.0]])
+    assert opacity_from_density(densities[:0], lengths[:0]).shape == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("densities", "lengths", "directions", "message"),
+    [
+        (torch.ones(4, 3), torch.ones(4), None, r"got \(4, 3\) and \(4,\)"),
+        (torch.ones(2, 4, 1), torch.ones(4), None, r"got \(2, 4, 1\) and \(4,\)"),
+        (torch.ones(2, 4, 1), torch.ones(2, 4), torch.ones(3), r"\(2, 3\), got \(3,\)"),
+    ],
+)
+def test_densities_that_do_not_fit(densities, lengths, directions, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        opacity_from_density(densities, lengths, directions)

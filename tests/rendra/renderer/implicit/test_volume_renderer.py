@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from assertions import assert_close, assert_finite
 from far_device import Far, far  # noqa: F401
 
+from rendra.kernels.march_volume import march_volume
 from rendra.renderer import (
     AbsorptionOnlyRaymarcher,
     EmissionAbsorptionRaymarcher,
@@ -19,6 +20,7 @@ from rendra.renderer import (
     look_at_view_transform,
     ray_bundle_to_ray_points,
 )
+from rendra.renderer.implicit.volume_march import march_in_one_pass
 from rendra.structures import Volumes
 
 
@@ -154,6 +156,147 @@ def test_other_samplers_marchers_and_shared_grids() -> None:
     assert features.grad.abs().sum() > 0
     silhouettes, _ = VolumeRenderer(sampler(6), AbsorptionOnlyRaymarcher())(looking(), volumes)
     assert silhouettes.shape[:3] == (2, 6, 6)
+
+
+# -- in one pass, and sample by sample
+
+
+def in_both_ways(monkeypatch, cameras, volumes, leaves, marcher=None, rays=None, is_fast=True):
+    """Images and gradients in one pass, and from samples; whether the first took one pass is checked."""
+    marcher = EmissionAbsorptionRaymarcher() if marcher is None else marcher
+    render = VolumeRenderer(sampler(16, 60) if rays is None else rays, marcher)
+    taken, results = [], []
+
+    def watched(*given):
+        taken.append(march_in_one_pass(*given))
+        return taken[-1]
+
+    for march in (watched, lambda *_: None):
+        monkeypatch.setattr("rendra.renderer.implicit.renderer.march_in_one_pass", march)
+        images, _ = render(cameras, volumes())
+        if not results:
+            weights = torch.randn_like(images)
+        results.append((images.detach(), *torch.autograd.grad((images * weights).sum(), leaves)))
+    assert (taken[0] is not None) == is_fast
+    return results
+
+
+def assert_same(both) -> None:
+    assert_close(both[0][0], both[1][0])
+    for fast, slow in zip(both[0][1:], both[1][1:], strict=True):
+        assert (fast - slow).norm() <= 2e-5 * slow.norm()
+
+
+def leaves_of(*shape: int, features: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    return torch.rand(1, *shape, requires_grad=True), torch.rand(features, *shape, requires_grad=True)
+
+
+@pytest.mark.parametrize("align_corners", [True, False])
+@pytest.mark.parametrize("distance", [0.1, 2.7], ids=["inside", "outside"])
+@pytest.mark.parametrize("kind", [FoVPerspectiveCameras, FoVOrthographicCameras])
+@pytest.mark.parametrize("features", [1, 3])
+def test_one_pass_is_sampling_and_marching(monkeypatch, align_corners, distance, kind, features) -> None:
+    densities, colours = leaves_of(7, 8, 9, features=features)
+    cameras = looking(distance)
+
+    def volumes() -> Volumes:
+        return Volumes(
+            (0.3 * densities)[None].expand(2, 1, 7, 8, 9), (2 * colours)[None].expand(2, features, 7, 8, 9),
+            (0.3, 0.2, 0.1), (0.1, 0.2, 0.3), align_corners,
+        )  # fmt: skip
+
+    cameras = kind(R=cameras.R, T=cameras.T)
+    assert_same(in_both_ways(monkeypatch, cameras, volumes, (densities, colours)))
+
+
+@pytest.mark.parametrize("features", [True, False])
+def test_one_pass_of_silhouettes(monkeypatch, features) -> None:
+    densities, colours = leaves_of(5, 6, 7)
+    own = colours.expand(2, 3, 5, 6, 7) if features else None
+    both = in_both_ways(
+        monkeypatch, looking(), lambda: Volumes((0.2 * densities).expand(2, 1, 5, 6, 7), own, 0.3), (densities,),
+        AbsorptionOnlyRaymarcher(),
+    )  # fmt: skip
+    assert both[0][0].shape == (2, 16, 16, 1)
+    assert_same(both)
+
+
+def test_one_pass_of_different_sizes_and_places(monkeypatch) -> None:
+    torch.manual_seed(0)
+    sizes = [(3, 4, 5), (6, 2, 1)]
+    leaves = [torch.rand(channels, *size, requires_grad=True) for channels in (1, 2) for size in sizes]
+
+    def volumes() -> Volumes:
+        return Volumes([0.3 * each for each in leaves[:2]], leaves[2:], torch.tensor([[0.5], [0.3]]))
+
+    assert_same(in_both_ways(monkeypatch, looking(), volumes, leaves))
+
+
+def test_one_pass_for_every_ray_sampler(monkeypatch) -> None:
+    densities, colours = leaves_of(6, 6, 6)
+    rays = RayBundle(
+        *torch.randn(2, 2, 5, 3), torch.linspace(0, 4, 30).expand(2, 5, 30).clone(), torch.zeros(2, 5, 2)
+    )
+    uneven = rays._replace(lengths=rays.lengths.square())
+
+    def volumes() -> Volumes:
+        return Volumes((0.3 * densities).expand(2, 1, 6, 6, 6), colours.expand(2, 3, 6, 6, 6), 0.4)
+
+    for bundle, is_fast in ((rays, True), (uneven, False)):
+        both = in_both_ways(
+            monkeypatch, looking(), volumes, (densities, colours), rays=lambda b=bundle, **_: b, is_fast=is_fast
+        )
+        assert_same(both)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"surface_thickness": 2}, {"dtype": torch.float64}, {"dense": 1.5}, {"camera": True}, {"channels": 2}],
+    ids=str,
+)
+@pytest.mark.filterwarnings("ignore:rays_densities must lie")
+def test_other_combinations_are_sampled(monkeypatch, change) -> None:
+    dtype = change.get("dtype", torch.float32)
+    densities, colours = (each.detach().to(dtype).requires_grad_() for each in leaves_of(4, 4, 4))
+    cameras = looking()
+    cameras = FoVPerspectiveCameras(R=cameras.R.to(dtype), T=cameras.T.to(dtype).requires_grad_("camera" in change))
+    marcher = EmissionAbsorptionRaymarcher(change.get("surface_thickness", 1))
+    own = torch.zeros(2, 40, 4, 4, 4, dtype=dtype) if "channels" in change else colours.expand(2, 3, 4, 4, 4)
+
+    def volumes() -> Volumes:
+        return Volumes((change.get("dense", 0.5) * densities).expand(2, 1, 4, 4, 4), own, 0.4)
+
+    assert_same(in_both_ways(monkeypatch, cameras, volumes, (densities,), marcher, is_fast=False))
+
+
+def test_densities_outside_of_their_range_are_warned_of() -> None:
+    volumes = Volumes(torch.full((2, 1, 3, 3, 3), 1.5), torch.ones(2, 3, 3, 3, 3))
+    with pytest.warns(UserWarning, match=r"rays_densities must lie in \[0, 1\]"):
+        VolumeRenderer(sampler(), EmissionAbsorptionRaymarcher())(looking(), volumes)
+
+
+def test_a_volume_shared_by_views_has_one_gradient_in_memory(monkeypatch) -> None:
+    densities, colours = leaves_of(4, 4, 4)
+    seen = []
+
+    def spy(grid, *given):
+        seen.append(len(grid))
+        return march_volume(grid, *given)
+
+    monkeypatch.setattr("rendra.renderer.implicit.volume_march.march_volume", spy)
+    render = VolumeRenderer(sampler(4), EmissionAbsorptionRaymarcher())
+
+    def shared() -> tuple[torch.Tensor, ...]:
+        return tuple(each.sigmoid()[None].expand(2, -1, -1, -1, -1) for each in (densities, colours))
+
+    render(looking(), Volumes(*shared()))[0].sum().backward()
+    retained, features = shared()
+    retained.retain_grad()
+    render(looking(), Volumes(retained, features))[0].sum().backward()
+    assert seen == [1, 2]
+    assert retained.grad.shape == (2, 1, 4, 4, 4)
+    assert_finite(densities.grad)
 
 
 def test_pictures_stay_on_their_device(far) -> None:  # noqa: F811
