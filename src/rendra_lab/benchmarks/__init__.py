@@ -5,6 +5,8 @@ the same input. Steps of tasks and whole commands are rendra's alone.
 """
 
 from rendra_lab.benchmarks.geometry import GEOMETRY
+from rendra_lab.benchmarks.rays import RAYS
 from rendra_lab.benchmarks.rendering import RENDERING
+from rendra_lab.benchmarks.volumes import VOLUMES
 
-BENCHMARKS = (*RENDERING, *GEOMETRY)
+BENCHMARKS = (*RENDERING, *GEOMETRY, *RAYS, *VOLUMES)

@@ -28,7 +28,8 @@ def forward(
 ) -> None:
     """Write features (R, C), opacity (R,), depth (R,) and weights (M,)."""
     samples = values, _NONE if deltas is None else deltas, features, positions
-    _composite(*samples, ray_first, deltas is not None, max(stop_below, _NOTHING), num_threads(), *outputs)
+    stop = stop_below if deltas is None else max(stop_below, _NOTHING)
+    _composite(*samples, ray_first, deltas is not None, stop, num_threads(), *outputs)
 
 
 def backward(
@@ -45,8 +46,8 @@ def backward(
     """Write the gradients of values (M,), features (M, C), and, where not of size 0, deltas and positions (M,)."""
     samples = values, _NONE if deltas is None else deltas, features, positions
     upstream = (*upstream[:3], _NONE if upstream[3] is None else upstream[3])
-    _differentiate(samples, weights, ray_first, deltas is not None, max(stop_below, _NOTHING), num_threads(),
-                   upstream, grads)  # fmt: skip
+    stop = stop_below if deltas is None else max(stop_below, _NOTHING)
+    _differentiate(samples, weights, ray_first, deltas is not None, stop, num_threads(), upstream, grads)
 
 
 @scalar_kernel
@@ -55,6 +56,13 @@ def opacity_of(x):
     series = x * (ONE - _I2 * x * (ONE - _I3 * x * (ONE - _I4 * x * (ONE - _I5 * x * (ONE - _I6 * x * (
         ONE - _I7 * x * (ONE - _I8 * x * (ONE - _I9 * x))))))))  # fmt: skip
     return series if abs(x) < _THIN else ONE - exponential(-x)
+
+
+@scalar_kernel
+def _past(clear, alpha):
+    """Transmittance behind a sample."""
+    clear *= 1.0 - np.float64(alpha)
+    return clear if abs(clear) > _NOTHING else 0.0
 
 
 @scalar_kernel
@@ -72,7 +80,7 @@ def _weigh(values, deltas, by_density, stop, first, end, weights):
             before = exponential(-np.float32(thickness))
         else:
             weights[m] = before * values[m]
-            clear *= 1.0 - np.float64(values[m])
+            clear = _past(clear, values[m])
             before = np.float32(clear)
     return opacity_of(np.float32(thickness)) if by_density else np.float32(1.0 - clear)
 
@@ -120,7 +128,7 @@ def _transmit(values, deltas, by_density, stop, first, end, clears):
             clears[m] = before
         else:
             clears[m] = before
-            clear *= 1.0 - np.float64(values[m])
+            clear = _past(clear, values[m])
             before = np.float32(clear)
     return end
 
@@ -218,4 +226,4 @@ def _see(alphas, ray_first, threshold, workers, mask):
                 clear = 1.0
                 for m in range(ray_first[r], ray_first[r + 1]):
                     mask[m] = clear >= threshold
-                    clear *= 1.0 - np.float64(alphas[m])
+                    clear = _past(clear, alphas[m])

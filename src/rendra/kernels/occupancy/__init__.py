@@ -61,7 +61,7 @@ def traverse(
         box: (2, 3) the corners of the grid.
         step: length of a sample, as a distance along the ray.
         offset: (R,) shift of each ray's samples in steps, in [0, 1): uniform noise in training; None is 0.
-        growth: of samples with the distance, 1/256 for a scene without end; 0 leaves them equally long.
+        growth: of samples with the distance, in [0, 1]: 1/256 for a scene without end; 0 leaves them equally long.
         max_samples: most samples of one ray, the nearest stay; None is all.
 
     Raises:
@@ -71,8 +71,8 @@ def traverse(
     _check_rays(origins, directions, {"nearest": nearest, "farthest": farthest, "offset": offset})
     _check_grid("occupied", occupied, torch.bool, origins.device)
     _check_box(box, origins)
-    if not (0 < step < math.inf and 0 <= growth < math.inf):
-        raise ValueError(f"step must be positive and growth not negative, both finite; got {step} and {growth}")
+    if not (0 < step < math.inf and 0 <= growth <= 1):
+        raise ValueError(f"step must be positive and finite and growth in [0, 1], got {step} and {growth}")
     if max_samples is not None and max_samples < 1:
         raise ValueError(f"max_samples must be at least 1, or None for all, got {max_samples}")
     offset = torch.zeros_like(nearest) if offset is None else offset

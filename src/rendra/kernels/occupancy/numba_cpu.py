@@ -2,8 +2,9 @@
 
 Rounding is monotone: along a ray the cell of a sample's middle never turns back. So if two samples lie in one cell,
 or in one block of cells, all samples between them do; a jump over an empty block is checked at its two ends, and the
-result is that of asking every sample. Blocks of 4^3 and 16^3 cells without an occupied one are crossed at once. Runs
-of samples are noted while a ray is walked, so that most rays are walked only once.
+result is that of asking every sample. Blocks of 4^3 and 16^3 cells without an occupied one are crossed at once. Where
+a jump must end is computed with a bound on its rounding error, and asked only if that leaves two answers. Runs of
+samples are noted while a ray is walked, and filled in when their number is known.
 """
 
 import math
@@ -17,9 +18,10 @@ from rendra.kernels.parallel import num_threads, parallel_kernel, scalar_kernel
 LATTICE_END = 2**24  # from here on float32 cannot count
 _MOST_SAMPLES = 2**28
 _RAYS_AT_ONCE = 64
-_RUNS = 16  # of samples, noted for each ray; a ray with more is walked again
+_RUNS = 32  # of samples, noted for each ray; if one has more, rays are walked again
 _LEAST = np.float32(1e-30)  # a slope below it is none, where a guess will do
 _STEPS = np.float32(LATTICE_END)
+_ROUNDING = np.float32(2.0**-20)  # sixteen roundings: more than there are between a ray and the cell of a sample
 
 
 def forward(
@@ -45,24 +47,29 @@ def forward(
     grid = (*box[0], *scale, *size.astype(np.float32))
     pace = _pace(step, growth)
     workers, num_rays = num_threads(), len(origins)
-    runs = np.empty((num_rays, 2 * _RUNS), np.int32)
     num_runs, ray_first = np.zeros(num_rays, np.int64), np.zeros(num_rays + 1, np.int64)
     rays = origins, directions, nearest, farthest, offset
-    if bounds[0] <= bounds[1]:
-        _walk_all(rays, pace, grid, levels, bounds, max_samples, workers, runs, num_runs, ray_first[1:])
+    noted = 0 if bounds[0] > bounds[1] else _RUNS  # nothing to walk to in an empty grid
+    runs = np.empty((num_rays, 2 * noted), np.int32)
+    while noted:
+        _walk_all(rays, pace, grid, *levels, bounds, max_samples, workers, runs, num_runs, ray_first[1:])
+        noted = int(num_runs.max(initial=0))
+        if 2 * noted <= runs.shape[1]:
+            break
+        runs = np.empty((num_rays, 2 * noted), np.int32)
     np.cumsum(ray_first, out=ray_first)
     total = int(ray_first[-1])
     if total > _MOST_SAMPLES:
         raise ValueError(f"a step of {step} asks for {total:,} samples; at most {_MOST_SAMPLES:,} are given at once")
     starts, ends, ray = np.empty(total, np.float32), np.empty(total, np.float32), np.empty(total, np.int64)
-    _fill_all(rays, pace, grid, levels, bounds, workers, runs, num_runs, ray_first, starts, ends, ray)
+    _fill_all(rays, pace, workers, runs, num_runs, ray_first, starts, ends, ray)
     return ray_first, starts, ends, ray
 
 
-def _pace(step: float, growth: float) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """The step, the steps in one unit, where steps begin to grow, and their rate."""
+def _pace(step: float, growth: float) -> tuple[np.float32, ...]:
+    """The step, the steps in one unit, where steps begin to grow, their rate, and how far middles are then off."""
     knee, rate = (np.float32(step / growth), np.float32(math.log1p(growth) / step)) if growth else (INFINITY, ZERO)
-    return np.float32(step), np.float32(1 / step), knee, rate
+    return np.float32(step), np.float32(1 / step), knee, rate, np.float32(growth / 2)
 
 
 def _levels(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,14 +117,14 @@ def _any_of_blocks(words, workers, blocks):
 @scalar_kernel
 def _distance(place, pace):
     """Distance along the ray of a place on the scale on which all steps are equally long."""
-    _, _, knee, rate = pace
+    _, _, knee, rate, _ = pace
     return knee * math.exp((place - knee) * rate) if place > knee else place
 
 
 @scalar_kernel
 def _place(distance, pace):
     """The inverse of `_distance`."""
-    _, _, knee, rate = pace
+    _, _, knee, rate, _ = pace
     return knee + math.log(distance / knee) / rate if distance > knee else distance
 
 
@@ -167,32 +174,36 @@ def _is_inside(cell, bounds):
 
 
 @scalar_kernel
-def _crossing(plane, origin, direction, low, scale):
-    """Roughly where a ray meets a plane between cells along one axis; infinite if it does not."""
-    return (plane / scale + low - origin) / direction if abs(direction) > _LEAST else INFINITY
+def _crossings(origin, direction, low, high, scale):
+    """Of planes at p cells along one axis: the ray meets them at p * slope + at, give or take an error."""
+    if abs(direction) < _LEAST:
+        return ZERO, INFINITY, ZERO
+    inverse = ONE / direction
+    error = _ROUNDING * (abs(origin) + abs(low) + abs(high)) * abs(inverse)
+    return inverse / scale, (low - origin) * inverse, error
 
 
 @scalar_kernel
-def _sample_at(distance, lattice, pace, total):
-    """Roughly the first sample whose middle is at that distance or beyond: a number in [0, total]."""
+def _sample_at(distance, lattice, pace):
+    """The first sample whose middle is at that distance or beyond, as a number not yet rounded up."""
     base, offset, _ = lattice
-    guess = np.ceil((_place(distance, pace) - base) * pace[1] - offset - HALF)
-    return np.int64(min(max(guess, ZERO), np.float32(total)))
+    return (_place(distance, pace) - base) * pace[1] - offset - HALF
 
 
 @scalar_kernel
 def _entry(ray, lattice, pace, grid, bounds, total):
-    """The first of the samples, all of them in order, that is not before the bounds; and its cell."""
-    low, high = -1, total
+    """The first of all samples that is not before the bounds; and its cell."""
+    ox, oy, oz, dx, dy, dz = ray
+    lx, ly, lz, sx, sy, sz, _, _, _ = grid
+    low, high = 0, total
     cell = _cells(0, ray, lattice, pace, grid)
     if not _is_before(cell, ray, bounds):
-        return 0, cell
-    distance = ZERO
-    for axis in range(3):
-        if abs(ray[3 + axis]) > _LEAST:
-            plane = np.float32(bounds[2 * axis] if ray[3 + axis] > ZERO else bounds[2 * axis + 1] + 1)
-            distance = max(distance, _crossing(plane, ray[axis], ray[3 + axis], grid[axis], grid[3 + axis]))
-    probe, turn, low = _sample_at(distance, lattice, pace, total), 0, 0
+        return low, cell
+    distance = max(_entry_along(ox, dx, lx, sx, bounds[0], bounds[1]), ZERO)
+    distance = max(_entry_along(oy, dy, ly, sy, bounds[2], bounds[3]), distance)
+    distance = max(_entry_along(oz, dz, lz, sz, bounds[4], bounds[5]), distance)
+    guess = np.ceil(_sample_at(distance, lattice, pace))
+    probe, turn = np.int64(min(max(guess, ZERO), np.float32(total))), 0
     while high - low > 1:
         probe = min(max(probe, low + 1), high - 1)
         here = _cells(probe, ray, lattice, pace, grid)
@@ -207,28 +218,28 @@ def _entry(ray, lattice, pace, grid, bounds, total):
 
 
 @scalar_kernel
-def _leave(k, cell, shift, ray, lattice, pace, grid, total):
-    """The first sample after k that is in another block of 2^shift cells a side; and its cell."""
-    distance = INFINITY
-    for axis in range(3):
-        direction = ray[3 + axis]
-        side = (cell[axis] >> shift) + (1 if direction > ZERO else 0)
-        crossing = _crossing(np.float32(side << shift), ray[axis], direction, grid[axis], grid[3 + axis])
-        distance = min(distance, crossing)
-    low, high, beyond = k, total, cell
-    probe, turn = _sample_at(distance, lattice, pace, total), 0
+def _entry_along(origin, direction, low, scale, first, last):
+    """Roughly where a ray meets the bounds along one axis."""
+    plane = np.float32(first if direction > ZERO else last + 1)
+    return (plane / scale + low - origin) / direction if abs(direction) > _LEAST else ZERO
+
+
+@scalar_kernel
+def _search(k, cell, shift, probe, ray, lattice, pace, grid, total):
+    """The first sample after k that is in another block of 2^shift cells a side, by asking: first at a guess."""
+    low, high, turn = k, total, 0
+    x, y, z = cell
     while high - low > 1:
         probe = min(max(probe, low + 1), high - 1)
-        here = _cells(probe, ray, lattice, pace, grid)
-        x, y, z = here[0] ^ cell[0], here[1] ^ cell[1], here[2] ^ cell[2]
-        if (x | y | z) >> shift == 0:
+        i, j, l = _cells(probe, ray, lattice, pace, grid)
+        if ((x ^ i) | (y ^ j) | (z ^ l)) >> shift == 0:
             low, probe = probe, probe + 1
         else:
-            high, beyond, probe = probe, here, probe - 1
+            high, probe = probe, probe - 1
         turn += 1
         if turn > 2:
             probe = (low + high) // 2
-    return high, beyond
+    return high
 
 
 @scalar_kernel
@@ -236,48 +247,66 @@ def _size_of_lattice(lattice, pace):
     """How many samples a ray has wherever they lie: those that begin before its end."""
     base, offset, farthest = lattice
     guess = np.ceil((_place(farthest, pace) - base) * pace[1] - offset)
-    total = np.int64(min(max(guess, ZERO), _STEPS))
-    while total > 0 and _start(total - 1, lattice, pace) >= farthest:
-        total -= 1
-    while total < LATTICE_END and _start(total, lattice, pace) < farthest:
-        total += 1
-    return total
+    low, high = -1, LATTICE_END
+    probe, turn = np.int64(min(max(guess, ZERO), _STEPS)), 0
+    while high - low > 1:
+        probe = min(max(probe, low + 1), high - 1)
+        if _start(probe, lattice, pace) < farthest:
+            low, probe = probe, probe + 1
+        else:
+            high, probe = probe, probe - 1
+        turn += 1
+        if turn > 2:
+            probe = (low + high) // 2
+    return high
 
 
 @scalar_kernel
-def _emptiness(cell, levels):
-    """Logarithm of the side of the largest empty block around a cell; -1 if the cell is occupied."""
-    cells, blocks, regions = levels
-    x, y, z = cell
-    if regions[z >> 4, y >> 4, x >> 4] == 0:
-        return 4
-    if blocks[z >> 2, y >> 2, x >> 2] == 0:
-        return 2
-    return 0 if cells[z, y, x] == 0 else -1
-
-
-@scalar_kernel
-def _walk(ray, lattice, pace, grid, levels, bounds, most, runs):
+def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, runs):
     """Note runs [begin, end) of samples in `runs`, as many as it holds: the number of samples, and of runs."""
     total = _size_of_lattice(lattice, pace)
     if total == 0:
         return 0, 0
+    ox, oy, oz, dx, dy, dz = ray
+    lx, ly, lz, sx, sy, sz, nx, ny, nz = grid
+    slope_x, at_x, error_x = _crossings(ox, dx, lx, lx + nx / sx, sx)
+    slope_y, at_y, error_y = _crossings(oy, dy, ly, ly + ny / sy, sy)
+    slope_z, at_z, error_z = _crossings(oz, dz, lz, lz + nz / sz, sz)
+    ahead_x, ahead_y, ahead_z = np.int64(dx > ZERO), np.int64(dy > ZERO), np.int64(dz > ZERO)
+    end_of_lattice, blur = np.float32(total), _ROUNDING * abs(lattice[0])
     k, cell = _entry(ray, lattice, pace, grid, bounds, total)
     count, num_runs, last = 0, 0, -1
     while k < total and count < most and _is_inside(cell, bounds):
-        shift = _emptiness(cell, levels)
-        beyond, next_cell = _leave(k, cell, max(shift, 0), ray, lattice, pace, grid, total)
-        if shift < 0:
+        x, y, z = cell
+        is_occupied, shift = False, 0
+        if regions[z >> 4, y >> 4, x >> 4] == 0:
+            shift = 4
+        elif blocks[z >> 2, y >> 2, x >> 2] == 0:
+            shift = 2
+        else:
+            is_occupied = cells[z, y, x] != 0
+        leave_x = np.float32(((x >> shift) + ahead_x) << shift) * slope_x + at_x
+        leave_y = np.float32(((y >> shift) + ahead_y) << shift) * slope_y + at_y
+        leave_z = np.float32(((z >> shift) + ahead_z) << shift) * slope_z + at_z
+        early = min(leave_x - error_x, min(leave_y - error_y, leave_z - error_z))
+        late = min(leave_x + error_x, min(leave_y + error_y, leave_z + error_z))
+        early, late = early - _ROUNDING * abs(early) - blur, late + _ROUNDING * abs(late) + blur
+        early = np.ceil(_sample_at(early, lattice, pace) - pace[4])
+        late = np.ceil(_sample_at(late, lattice, pace) + pace[4])
+        beyond = np.int64(min(max(late, np.float32(k + 1)), end_of_lattice))
+        if early < end_of_lattice and (early != late or beyond == total - 1):  # the last middle is nearer
+            beyond = _search(k, cell, shift, beyond, ray, lattice, pace, grid, total)
+        if is_occupied:
             end = min(beyond, k + most - count)
             count += end - k
             if k != last:
                 num_runs += 1
-                if 2 * num_runs <= len(runs):
-                    runs[2 * num_runs - 2] = k
-            if 2 * num_runs <= len(runs):
-                runs[2 * num_runs - 1] = end
+                if 2 * num_runs <= runs.shape[1]:
+                    runs[r, 2 * num_runs - 2] = k
+            if 2 * num_runs <= runs.shape[1]:
+                runs[r, 2 * num_runs - 1] = end
             last = beyond
-        k, cell = beyond, next_cell
+        k, cell = beyond, _cells(beyond, ray, lattice, pace, grid)
     return count, num_runs
 
 
@@ -289,41 +318,37 @@ def _ray_of(rays, r, pace):
     dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
     near = nearest[r]
     lattice = (_place(near, pace), offset[r], farthest[r])
-    total = abs(ox) + abs(oy) + abs(oz) + abs(dx) + abs(dy) + abs(dz) + abs(near)
-    is_ray = math.isfinite(total) and near < farthest[r] and (dx != ZERO or dy != ZERO or dz != ZERO)
+    is_finite = math.isfinite(ox) and math.isfinite(oy) and math.isfinite(oz) and math.isfinite(near)
+    is_finite = is_finite and math.isfinite(dx) and math.isfinite(dy) and math.isfinite(dz)
+    is_ray = is_finite and near < farthest[r] and (dx != ZERO or dy != ZERO or dz != ZERO)
     return (ox, oy, oz, dx, dy, dz), lattice, is_ray
 
 
 @parallel_kernel
-def _walk_all(rays, pace, grid, levels, bounds, most, workers, runs, num_runs, counts):
+def _walk_all(rays, pace, grid, cells, blocks, regions, bounds, most, workers, runs, num_runs, counts):
     num_rays = len(num_runs)
     for worker in prange(workers):
         for block in range(worker, (num_rays + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE, workers):
             for r in range(block * _RAYS_AT_ONCE, min((block + 1) * _RAYS_AT_ONCE, num_rays)):
                 ray, lattice, is_ray = _ray_of(rays, r, pace)
                 if is_ray:
-                    counts[r], num_runs[r] = _walk(ray, lattice, pace, grid, levels, bounds, most, runs[r])
+                    counts[r], num_runs[r] = _walk(
+                        ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, runs
+                    )
 
 
 @parallel_kernel
-def _fill_all(rays, pace, grid, levels, bounds, workers, runs, num_runs, ray_first, starts, ends, index):
+def _fill_all(rays, pace, workers, runs, num_runs, ray_first, starts, ends, index):
     num_rays = len(num_runs)
     for worker in prange(workers):
         for block in range(worker, (num_rays + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE, workers):
             for r in range(block * _RAYS_AT_ONCE, min((block + 1) * _RAYS_AT_ONCE, num_rays)):
-                if num_runs[r] == 0:
-                    continue
-                ray, lattice, _ = _ray_of(rays, r, pace)
-                noted = runs[r]
-                if num_runs[r] > _RUNS:
-                    noted = np.empty(2 * num_runs[r], np.int32)
-                    most = ray_first[r + 1] - ray_first[r]
-                    _walk(ray, lattice, pace, grid, levels, bounds, most, noted)
+                _, lattice, _ = _ray_of(rays, r, pace)
                 m = ray_first[r]
                 for n in range(num_runs[r]):
-                    end = _start(np.int64(noted[2 * n]), lattice, pace)
-                    for k in range(noted[2 * n], noted[2 * n + 1]):
-                        starts[m], index[m] = end, r
+                    start = _start(np.int64(runs[r, 2 * n]), lattice, pace)
+                    for k in range(runs[r, 2 * n], runs[r, 2 * n + 1]):
                         end = _start(k + 1, lattice, pace)
-                        ends[m] = min(end, lattice[2])
+                        starts[m], ends[m], index[m] = start, min(end, lattice[2]), r
+                        start = end
                         m += 1

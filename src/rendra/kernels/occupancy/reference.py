@@ -2,7 +2,8 @@
 
 Sample k of a ray reaches from t_k to min(t_{k+1}, farthest), where
 
-    t_k = d(u + (offset + k) step),    d(u) = u up to the knee K = step / growth, K (1 + growth)^((u - K) / step) behind,
+    t_k = d(u + (offset + k) step),    d(u) = u up to the knee K = step / growth,
+                                       d(u) = K (1 + growth)^((u - K) / step) behind it,
 
 and d(u) is `nearest` for offset = k = 0: steps are equally long up to the knee, then `growth` times the distance at
 which they begin. Without growth there is no knee. The rules:
