@@ -5,8 +5,9 @@ the same input. Steps of tasks and whole commands are rendra's alone.
 """
 
 from rendra_lab.benchmarks.geometry import GEOMETRY
+from rendra_lab.benchmarks.radiance import RADIANCE
 from rendra_lab.benchmarks.rays import RAYS
 from rendra_lab.benchmarks.rendering import RENDERING
 from rendra_lab.benchmarks.volumes import VOLUMES
 
-BENCHMARKS = (*RENDERING, *GEOMETRY, *RAYS, *VOLUMES)
+BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *VOLUMES)
