@@ -12,9 +12,12 @@ from rendra_lab.experiment import run
 CONF = Path(__file__).parents[2] / "conf"
 
 # a step of these takes a laptop minutes
+_TINY = ("data.image_size=16", "data.pixels_per_step=12", "field.width=16", "callbacks.turntable.frames=0")
 SMALLER = {
-    "nerf_book": ("data.image_size=16", "data.pixels_per_step=12", "field.width=16", "sampler.samples=4"),
-    "nerf_original": ("data.image_size=16", "data.pixels_per_step=12", "field.width=16", "sampler.fine_samples=4"),
+    "nerf_book": (*_TINY, "sampler.samples=4"),
+    "nerf_book_laptop": (*_TINY, "sampler.samples=4"),
+    "nerf_original": (*_TINY, "sampler.fine_samples=4"),
+    "nerf_original_laptop": (*_TINY, "sampler.fine_samples=4"),
 }
 
 

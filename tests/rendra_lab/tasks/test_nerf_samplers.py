@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from assertions import assert_close, assert_finite
+from far_device import Far, far  # noqa: F401
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -12,7 +13,7 @@ from rendra.renderer import EmissionAbsorptionRaymarcher
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays
 from rendra_lab.tasks.nerf.fields import RadianceField
-from rendra_lab.tasks.nerf.mlp_fields import MLPBook
+from rendra_lab.tasks.nerf.mlp_fields import MLPBook, MLPOriginal
 from rendra_lab.tasks.nerf.samplers import HierarchicalRenderer, StratifiedRenderer, composite
 
 
@@ -36,9 +37,9 @@ class Fog(RadianceField):
         return -torch.expm1(-self.density * inside * steps)
 
 
-def upward(count: int = 4, near: float = 0.5, far: float = 2.5) -> Rays:
+def upward(count: int = 4, near: float = 0.5, end: float = 2.5) -> Rays:
     up = torch.tensor([0.0, 0.0, 1.0]).expand(count, 3)
-    return Rays(torch.zeros(count, 3), up, torch.full((count,), near), torch.full((count,), far))
+    return Rays(torch.zeros(count, 3), up, torch.full((count,), near), torch.full((count,), end))
 
 
 def both(**settings: object) -> list[nn.Module]:
@@ -77,7 +78,7 @@ def test_rays_without_length_see_nothing(renderer: nn.Module) -> None:
 @pytest.mark.parametrize("endless", [True, False])
 def test_no_field_is_seen_where_there_is_nothing(make: type, endless: bool) -> None:
     """An opacity that ignores the length of a sample, and a last sample without an end."""
-    rays = upward(3, near=0.5, far=0.5)
+    rays = upward(3, near=0.5, end=0.5)
     seen = StratifiedRenderer(make(), samples=4, endless=endless)(rays)
     assert_close(seen.opacity, torch.zeros(3))
     (seen.rgb.sum() + seen.opacity.sum()).backward()
@@ -114,7 +115,7 @@ def test_jitter_stays_in_its_bins(disparity: bool) -> None:
 
 
 def test_disparity_begins_a_little_before_the_camera() -> None:
-    distances = StratifiedRenderer(Fog(), disparity=True).eval().distances(upward(1, near=0.0, far=10.0), 5)
+    distances = StratifiedRenderer(Fog(), disparity=True).eval().distances(upward(1, near=0.0, end=10.0), 5)
     assert_finite(distances)
     assert distances[0, 0] == pytest.approx(0.01)
 
@@ -162,7 +163,7 @@ def test_both_fields_are_placed() -> None:
 
 def test_a_depth_range_stands_for_the_box() -> None:
     renderer = StratifiedRenderer(Fog(), samples=3, jitter=False, depth_range=[1.0, 3.0])
-    renderer(upward(2, near=0.5, far=0.5))
+    renderer(upward(2, near=0.5, end=0.5))
     assert_close(renderer.field.asked[0][:, 2], torch.tensor([1.0, 2.0, 3.0, 1.0, 2.0, 3.0]))
 
 
@@ -207,3 +208,19 @@ def test_light_comes_from_the_direction_of_each_ray() -> None:
     directions = F.normalize(torch.randn(6, 3), dim=1)
     rays = Rays(torch.zeros(6, 3), directions, torch.zeros(6), torch.ones(6))
     assert_close(StratifiedRenderer(Aimed(), samples=4)(rays).rgb, directions, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [MLPBook, MLPOriginal])
+def test_rays_are_followed_where_they_lie(far, make: type) -> None:  # noqa: F811
+    renderer = HierarchicalRenderer(make(width=8, chunk=20), make(width=8), coarse_samples=5, fine_samples=4)
+    for module in renderer.modules():
+        for name, buffer in module._buffers.items():
+            module._buffers[name] = buffer.to(far)
+        for name, parameter in module._parameters.items():
+            module._parameters[name] = nn.Parameter(parameter.detach().to(far))
+    rays = Rays(*(getattr(upward(), name).to(far) for name in Rays.names()))
+    seen = renderer(rays)
+    (seen.rgb.sum() + seen.rgb_coarse.sum()).backward()
+    assert all(isinstance(parameter.grad, Far) for parameter in renderer.parameters())
+    with torch.no_grad():
+        assert isinstance(renderer.eval()(rays).depth, Far)
