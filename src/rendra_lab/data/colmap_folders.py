@@ -166,18 +166,18 @@ def _no_points(num_images: int) -> _Points:
 def _seen_points(truth: Meshes, images: PosedImages) -> _Points:
     """Points sampled from the surface, the same ones every time, that two images or more show."""
     truth = truth.to("cpu")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        xyz, rgb = sample_points_from_meshes(truth, _NUM_POINTS, return_textures=True)
-    xyz, rgb = xyz[0], rgb[0].clamp(0, 1).mul(255).round().to(torch.uint8)
-    looks = [_look(truth, images, index, xyz) for index in range(len(images))]
+    generator = torch.Generator().manual_seed(0)
+    samples = sample_points_from_meshes(truth, _NUM_POINTS, True, True, generator=generator)
+    xyz, normals, rgb = (part[0] for part in samples)
+    rgb = rgb.clamp(0, 1).mul(255).round().to(torch.uint8)
+    looks = [_look(truth, images, index, xyz, normals) for index in range(len(images))]
     seen, xy = torch.stack([seen for seen, _ in looks]), torch.stack([xy for _, xy in looks])
     kept = seen.sum(0) >= 2
     return _Points(xyz[kept], rgb[kept], seen[:, kept], xy[:, kept])
 
 
-def _look(truth: Meshes, images: PosedImages, index: int, xyz: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether an image shows each of the points (P,), and where (P, 2)."""
+def _look(truth: Meshes, images: PosedImages, index: int, xyz: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether an image shows each of the points (P,) of a surface, and where (P, 2)."""
     height, width = images.sizes[index].tolist()
     intrinsics = images.intrinsics[index]
     in_view = xyz @ images.R[index] + images.T[index]
@@ -190,7 +190,8 @@ def _look(truth: Meshes, images: PosedImages, index: int, xyz: Tensor) -> tuple[
     inside = (in_view[:, 2] > 1e-6) & ((xy >= 0) & (xy < size) & (straight >= 0) & (straight < size)).all(1)
     column, row = straight.minimum(size - 1).clamp_min(0).long().unbind(1)
     nearest = _depth_map(truth, images, index)[row, column]
-    return inside & (nearest > 0) & (depth < nearest * (1 + _OCCLUSION)), xy
+    faces_us = ((images.positions[index] - xyz) * normals).sum(1) > 0
+    return inside & faces_us & (nearest > 0) & (depth < nearest * (1 + _OCCLUSION)), xy
 
 
 def _depth_map(truth: Meshes, images: PosedImages, index: int) -> Tensor:

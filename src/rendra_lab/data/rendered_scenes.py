@@ -66,7 +66,7 @@ class RenderedScene(SceneViews):
         **rays: Any,
     ) -> None:
         super().__init__(**rays)
-        if not hasattr(lights, "diffuse"):
+        if not callable(getattr(lights, "diffuse", None)):
             raise UserError(
                 f"{type(lights).__name__} moves with the camera; these views need a light that stands still"
             )

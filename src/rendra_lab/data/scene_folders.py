@@ -118,7 +118,7 @@ def _write_nerf_blender(scene: Scene, folder: Path) -> None:
 def _write_transforms(scene: Scene, folder: Path) -> None:
     splits = _splits(scene)
     lenses = [lens for images in splits.values() for lens in _lenses(images)]
-    shared = {key: value for key, value in lenses[0].items() if all(lens[key] == value for lens in lenses)}
+    shared = {key: value for key, value in lenses[0].items() if all(lens.get(key) == value for lens in lenses)}
     if "camera_model" not in shared:
         raise UserError("format=transforms has one camera model, but some of the lenses are fisheye lenses")
     frames: list[dict[str, Any]] = []

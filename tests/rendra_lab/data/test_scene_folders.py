@@ -34,16 +34,22 @@ def black_ball(radius: float = 0.08) -> Meshes:
 
 
 def made(**settings: Any) -> Scene:
-    settings = {"image_size": [40, 48], "counts": (5, 1, 2), "antialias": 6} | settings
-    return RenderedScene(black_ball(), AmbientLights(), **settings).load()
+    usual: dict[str, Any] = {"image_size": [40, 48], "counts": (5, 1, 2), "antialias": 6}
+    return RenderedScene(black_ball(), AmbientLights(), **(usual | settings)).load()
 
 
 def shown_at(path: Path) -> np.ndarray:
     """The middle of the ball in an image, in pixels from the upper left corner."""
-    pixels = np.asarray(Image.open(path), np.float64)
+    with Image.open(path) as image:
+        pixels = np.asarray(image, np.float64)
     weight = pixels[..., 3] if pixels.shape[2] == 4 else 255 - pixels[..., 0]
     y, x = np.mgrid[: weight.shape[0], : weight.shape[1]] + 0.5
     return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+
+
+def mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
+    with Image.open(path) as image:
+        return image.mode, image.size
 
 
 def through_opengl(
@@ -65,7 +71,7 @@ def test_nerf_blender_folders_say_where_things_are(tmp_path: Path) -> None:
         focal = 0.5 * 48 / math.tan(0.5 * record["camera_angle_x"])
         for frame in record["frames"]:
             path = folder / f"{frame['file_path']}.png"
-            assert Image.open(path).mode == "RGBA"
+            assert mode_and_size(path) == ("RGBA", (48, 40))
             expected = through_opengl(frame["transform_matrix"], z_up(PLACE), focal, (24, 20))
             np.testing.assert_allclose(shown_at(path), expected, atol=0.1)
 
@@ -109,7 +115,7 @@ def test_points_of_a_model_are_seen_by_no_camera_behind_them(tmp_path: Path) -> 
     for image in images:
         centre = -rotation(image["qvec"]).T @ image["tvec"]
         outwards = [points[number]["xyz"] - PLACE for number in image["points"]]
-        assert all(outward @ (centre - PLACE) > -1e-3 for outward in outwards)
+        assert all(outward @ (centre - PLACE) > -0.05 for outward in outwards)
 
 
 @pytest.mark.parametrize("distortion", [None, LENS, (*LENS, 0.01)])
@@ -130,8 +136,7 @@ def test_llff_folders_say_where_things_are(tmp_path: Path) -> None:
     for path, row in zip(sorted((folder / "images").iterdir()), table, strict=True):
         pose = row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
-        assert Image.open(path).mode == "RGB"
-        assert Image.open(path).size == (width, height) == (64, 64)
+        assert mode_and_size(path) == ("RGB", (width, height)) == ("RGB", (64, 64))
         down, right, back = pose[:, :3].T @ (PLACE - pose[:, 3])
         expected = [width / 2 + focal * right / -back, height / 2 + focal * down / -back]
         np.testing.assert_allclose(shown_at(path), expected, atol=0.1)
@@ -196,7 +201,7 @@ def test_images_without_alpha_stay_without(tmp_path: Path) -> None:
     scene = made()
     scene = replace(scene, train=replace(scene.train, has_alpha=False))
     folder = write_scene(scene, tmp_path / "scene", "nerf_blender")
-    assert Image.open(folder / "train" / "r_0.png").mode == "RGB"
+    assert mode_and_size(folder / "train" / "r_0.png") == ("RGB", (48, 40))
 
 
 def test_a_scene_without_truth_has_no_points(tmp_path: Path) -> None:
