@@ -168,25 +168,20 @@ def test_compacting_keeps_rays_apart():
 
 def test_every_element_is_written():
     alphas, densities, deltas, features, positions, first = ragged()
-    arrays = [x.numpy() for x in (features, positions, first)]
     rays, total = len(first) - 1, len(alphas)
     shapes = (rays, 3), (rays,), (rays,), (total,)
     for values, lengths in ((alphas, None), (densities, deltas.numpy())):
-        outputs = [torch.full(shape, float("nan")) for shape in shapes]
-        numba_cpu.forward(values.numpy(), lengths, *arrays, 0.2, tuple(x.numpy() for x in outputs))
-        for output in outputs:
-            assert_finite(output)
+        packed = values.numpy(), lengths, features.numpy(), positions.numpy()
+        outputs = [torch.full(shape, float("nan")).numpy() for shape in shapes]
+        numba_cpu.forward(packed, first.numpy(), 0.2, tuple(outputs))
         sizes = (total,), (0 if lengths is None else total,), (total, 3), (total,)
-        grads = [torch.full(size, float("nan")) for size in sizes]
-        numba_cpu.backward(
-            values.numpy(), lengths, *arrays, outputs[3].numpy(), 0.2, tuple(x.numpy() for x in outputs),
-            tuple(x.numpy() for x in grads),
-        )  # fmt: skip
-        for grad in grads:
-            assert_finite(grad)
+        grads = [torch.full(size, float("nan")).numpy() for size in sizes]
+        numba_cpu.backward(packed, first.numpy(), outputs[3], 0.2, tuple(outputs), tuple(grads))
+        for array in (*outputs, *grads):
+            assert_finite(torch.from_numpy(array))
     mask = torch.full((total,), True)
     mask.view(torch.uint8).fill_(77)
-    numba_cpu.visible(alphas.numpy(), arrays[2], 0.1, mask.numpy())
+    numba_cpu.visible(alphas.numpy(), first.numpy(), 0.1, mask.numpy())
     assert (mask.view(torch.uint8) <= 1).all()
 
 

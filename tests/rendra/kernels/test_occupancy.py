@@ -44,7 +44,7 @@ def bundle(num_rays=150):
 
 def specified(rays, occupied, step=STEP, offset=None, growth=0.0, max_samples=None, box=BOX):
     offset = torch.zeros_like(rays[2]) if offset is None else offset
-    return Samples(*reference.traverse(*rays, offset, occupied, box, step, growth, max_samples))
+    return Samples(*reference.traverse((*rays, offset), occupied, box, step, growth, max_samples))
 
 
 def assert_same(first, second):

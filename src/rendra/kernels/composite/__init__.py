@@ -4,7 +4,7 @@ Letters: R rays, M samples of all rays, C channels. The samples of ray r are [ra
 the nearest. Nothing is padded: a ray has as many samples as it needs, or none.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -168,14 +168,14 @@ def _words(tensor: Tensor) -> str:
     return f"{tuple(tensor.shape)} of {tensor.dtype} on {tensor.device}"
 
 
-def _arrays(*tensors: Tensor | None) -> list:
-    return [None if tensor is None else tensor.contiguous().numpy() for tensor in tensors]
+def _arrays(*tensors: Tensor | None) -> tuple[Any, ...]:
+    return tuple(None if tensor is None else tensor.contiguous().numpy() for tensor in tensors)
 
 
 @torch.library.custom_op("rendra::visible", mutates_args=(), device_types="cpu")
 def _visible_on_cpu(alphas: Tensor, ray_first: Tensor, threshold: float) -> Tensor:
     mask = torch.empty_like(alphas, dtype=torch.bool, memory_format=torch.contiguous_format)
-    numba_cpu.visible(*_arrays(alphas, ray_first), threshold, mask.numpy())
+    numba_cpu.visible(alphas.contiguous().numpy(), ray_first.contiguous().numpy(), threshold, mask.numpy())
     return mask
 
 
@@ -189,10 +189,8 @@ def _composite_on_cpu(
     values: Tensor, deltas: Tensor | None, features: Tensor, positions: Tensor, ray_first: Tensor, stop_below: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     outputs = _empty_outputs(features, ray_first)
-    numba_cpu.forward(
-        *_arrays(values, deltas, features, positions, ray_first), stop_below,
-        tuple(output.numpy() for output in outputs),
-    )  # fmt: skip
+    packed = _arrays(values, deltas, features, positions)
+    numba_cpu.forward(packed, ray_first.contiguous().numpy(), stop_below, _arrays(*outputs))
     return outputs
 
 
@@ -223,18 +221,16 @@ def _gradient_on_cpu(
     all_inputs: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     grads = _empty_gradients(features, deltas is not None, all_inputs)
-    numba_cpu.backward(
-        *_arrays(values, deltas, features, positions, ray_first, weights), stop_below,
-        tuple(_arrays(grad_out, grad_opacity, grad_depth, grad_weights)), tuple(grad.numpy() for grad in grads),
-    )  # fmt: skip
+    packed = _arrays(values, deltas, features, positions)
+    upstream: Any = _arrays(grad_out, grad_opacity, grad_depth, grad_weights)
+    first, seen = _arrays(ray_first, weights)
+    numba_cpu.backward(packed, first, seen, stop_below, upstream, _arrays(*grads))
     return grads
 
 
 @_gradient_on_cpu.register_fake
-def _(
-    values, deltas, features, positions, ray_first, weights, stop_below, out, opacity, depth, of_weights, all_inputs
-):  # type: ignore[no-untyped-def]
-    return _empty_gradients(features, deltas is not None, all_inputs)
+def _(values, deltas, features, *others):  # type: ignore[no-untyped-def]
+    return _empty_gradients(features, deltas is not None, others[-1])
 
 
 def _empty_gradients(features: Tensor, has_deltas: bool, all_inputs: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:

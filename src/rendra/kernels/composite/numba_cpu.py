@@ -17,37 +17,35 @@ _I2, _I3, _I4, _I5, _I6, _I7, _I8, _I9 = (np.float32(1.0 / k) for k in range(2, 
 _NONE = np.empty(0, np.float32)
 
 
-def forward(
-    values: np.ndarray,
-    deltas: np.ndarray | None,
-    features: np.ndarray,
-    positions: np.ndarray,
-    ray_first: np.ndarray,
-    stop_below: float,
-    outputs: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+Packed = tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]
+"""Values (M,), deltas (M,) where the values are densities, features (M, C), positions (M,)."""
+
+
+def forward(packed: Packed, ray_first: np.ndarray, stop_below: float, outputs: tuple[np.ndarray, ...]) -> None:
     """Write features (R, C), opacity (R,), depth (R,) and weights (M,)."""
-    samples = values, _NONE if deltas is None else deltas, features, positions
-    stop = stop_below if deltas is None else max(stop_below, _NOTHING)
-    _composite(*samples, ray_first, deltas is not None, stop, num_threads(), *outputs)
+    samples, by_density, stop = _arguments(packed, stop_below)
+    _composite(*samples, ray_first, by_density, stop, num_threads(), *outputs)
 
 
 def backward(
-    values: np.ndarray,
-    deltas: np.ndarray | None,
-    features: np.ndarray,
-    positions: np.ndarray,
+    packed: Packed,
     ray_first: np.ndarray,
     weights: np.ndarray,
     stop_below: float,
     upstream: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None],
-    grads: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    grads: tuple[np.ndarray, ...],
 ) -> None:
-    """Write the gradients of values (M,), features (M, C), and, where not of size 0, deltas and positions (M,)."""
-    samples = values, _NONE if deltas is None else deltas, features, positions
-    upstream = (*upstream[:3], _NONE if upstream[3] is None else upstream[3])
-    stop = stop_below if deltas is None else max(stop_below, _NOTHING)
-    _differentiate(samples, weights, ray_first, deltas is not None, stop, num_threads(), upstream, grads)
+    """Write the gradients of values (M,), deltas, features (M, C) and positions; some may be empty: not asked for."""
+    samples, by_density, stop = _arguments(packed, stop_below)
+    grad_weights = _NONE if upstream[3] is None else upstream[3]
+    _differentiate(samples, weights, ray_first, by_density, stop, num_threads(), (*upstream[:3], grad_weights), grads)
+
+
+def _arguments(packed: Packed, stop_below: float) -> tuple[tuple[np.ndarray, ...], bool, float]:
+    values, deltas, features, positions = packed
+    if deltas is None:
+        return (values, _NONE, features, positions), False, stop_below
+    return (values, deltas, features, positions), True, max(stop_below, _NOTHING)
 
 
 @scalar_kernel

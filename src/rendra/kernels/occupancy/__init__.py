@@ -76,11 +76,10 @@ def traverse(
     if max_samples is not None and max_samples < 1:
         raise ValueError(f"max_samples must be at least 1, or None for all, got {max_samples}")
     offset = torch.zeros_like(nearest) if offset is None else offset
-    rays = [tensor.detach() for tensor in (origins, directions, nearest, farthest, offset)]
-    arguments = *rays, occupied, box.detach(), float(step), float(growth), max_samples
+    rays = origins.detach(), directions.detach(), nearest.detach(), farthest.detach(), offset.detach()
     if origins.device.type != "cpu" or origins.dtype != torch.float32:
-        return Samples(*reference.traverse(*arguments))
-    return Samples(*_traverse_on_cpu(*arguments))
+        return Samples(*reference.traverse(rays, occupied, box.detach(), step, growth, max_samples))
+    return Samples(*_traverse_on_cpu(*rays, occupied, box.detach(), float(step), float(growth), max_samples))
 
 
 def cells_of(points: Tensor, box: Tensor, size: tuple[int, int, int]) -> Tensor:
@@ -211,9 +210,13 @@ def _traverse_on_cpu(
     growth: float,
     max_samples: int | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    tensors = origins, directions, nearest, farthest, offset, occupied, box
+    rays = (
+        origins.contiguous().numpy(), directions.contiguous().numpy(), nearest.contiguous().numpy(),
+        farthest.contiguous().numpy(), offset.contiguous().numpy(),
+    )  # fmt: skip
     most = numba_cpu.LATTICE_END if max_samples is None else max_samples
-    results = numba_cpu.forward(*(tensor.contiguous().numpy() for tensor in tensors), step, growth, most)
+    cells, corners = occupied.contiguous().numpy(), box.contiguous().numpy()
+    results = numba_cpu.forward(rays, cells, corners, step, growth, most)
     ray_first, starts, ends, ray_index = map(torch.from_numpy, results)
     return ray_first, starts, ends, ray_index
 

@@ -24,17 +24,12 @@ _STEPS = np.float32(LATTICE_END)
 _ROUNDING = np.float32(2.0**-20)  # sixteen roundings: more than there are between a ray and the cell of a sample
 
 
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Origins and directions (R, 3), nearest, farthest and offset (R,)."""
+
+
 def forward(
-    origins: np.ndarray,
-    directions: np.ndarray,
-    nearest: np.ndarray,
-    farthest: np.ndarray,
-    offset: np.ndarray,
-    occupied: np.ndarray,
-    box: np.ndarray,
-    step: float,
-    growth: float,
-    max_samples: int,
+    rays: Rays, occupied: np.ndarray, box: np.ndarray, step: float, growth: float, max_samples: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """First sample of each ray (R + 1,), and starts, ends and ray (M,) of the samples.
 
@@ -46,9 +41,8 @@ def forward(
     scale = size.astype(np.float32) / (box[1] - box[0])
     grid = (*box[0], *scale, *size.astype(np.float32))
     pace = _pace(step, growth)
-    workers, num_rays = num_threads(), len(origins)
+    workers, num_rays = num_threads(), len(rays[0])
     num_runs, ray_first = np.zeros(num_rays, np.int64), np.zeros(num_rays + 1, np.int64)
-    rays = origins, directions, nearest, farthest, offset
     noted = 0 if bounds[0] > bounds[1] else _RUNS  # nothing to walk to in an empty grid
     runs = np.empty((num_rays, 2 * noted), np.int32)
     while noted:

@@ -25,30 +25,26 @@ LATTICE_END = 2**24
 _SAMPLES_AT_ONCE = 2**20
 
 
+Rays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Origins and directions (R, 3), nearest, farthest and offset (R,)."""
+
+
 def traverse(
-    origins: Tensor,
-    directions: Tensor,
-    nearest: Tensor,
-    farthest: Tensor,
-    offset: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    step: float,
-    growth: float,
-    max_samples: int | None,
+    rays: Rays, occupied: Tensor, box: Tensor, step: float, growth: float, max_samples: int | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First sample of each ray (R + 1,), and starts, ends and ray (M,) of the samples."""
-    sizes = _lattice_sizes(origins, directions, nearest, farthest, offset, box, step, growth)
+    origins, directions, nearest, farthest, offset = rays
+    sizes = _lattice_sizes(rays, box, step, growth)
     longest = int(sizes.max()) if len(sizes) else 0
     parts = [(nearest[:0], nearest[:0], sizes[:0])]
     rows = max(1, _SAMPLES_AT_ONCE // max(1, longest))
-    for rays in torch.arange(len(origins), device=origins.device).split(rows):
-        here = [x[rays] for x in (origins, directions, nearest, farthest, offset)]
-        for first in range(0, int(sizes[rays].max()), _SAMPLES_AT_ONCE):
+    for some in torch.arange(len(origins), device=origins.device).split(rows):
+        here = origins[some], directions[some], nearest[some], farthest[some], offset[some]
+        for first in range(0, int(sizes[some].max()), _SAMPLES_AT_ONCE):
             k = torch.arange(first, min(first + _SAMPLES_AT_ONCE, longest), device=origins.device)
-            starts, ends, kept = _samples(*here, k, occupied, box, step, growth)
-            kept &= k < sizes[rays, None]
-            parts.append((starts[kept], ends[kept], rays[:, None].expand_as(kept)[kept]))
+            starts, ends, kept = _samples(here, k, occupied, box, step, growth)
+            kept &= k < sizes[some, None]
+            parts.append((starts[kept], ends[kept], some[:, None].expand_as(kept)[kept]))
     starts, ends, index = (torch.cat(column) for column in zip(*parts, strict=True))
     if max_samples is not None:
         kept = torch.arange(len(index), device=index.device) < _firsts(index, len(origins))[index] + max_samples
@@ -56,11 +52,9 @@ def traverse(
     return _firsts(index, len(origins)), starts, ends, index
 
 
-def _lattice_sizes(
-    origins: Tensor, directions: Tensor, nearest: Tensor, farthest: Tensor, offset: Tensor, box: Tensor, step: float,
-    growth: float,
-) -> Tensor:  # fmt: skip
+def _lattice_sizes(rays: Rays, box: Tensor, step: float, growth: float) -> Tensor:
     """A bound (R,) on the number of samples to ask."""
+    origins, directions, nearest, farthest, _ = rays
     is_ray = (nearest < farthest) & (directions != 0).any(1) & nearest.isfinite()
     is_ray &= origins.isfinite().all(1) & directions.isfinite().all(1)
     corners = torch.cartesian_prod(*box.T)
@@ -71,10 +65,10 @@ def _lattice_sizes(
 
 
 def _samples(
-    origins: Tensor, directions: Tensor, nearest: Tensor, farthest: Tensor, offset: Tensor, k: Tensor,
-    occupied: Tensor, box: Tensor, step: float, growth: float,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    rays: Rays, k: Tensor, occupied: Tensor, box: Tensor, step: float, growth: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Starts, ends (R, K) of samples k of some rays, and which are kept."""
+    origins, directions, nearest, farthest, offset = rays
     base, pace = _place(nearest, step, growth)[:, None], nearest.new_tensor(step)
     edges = torch.stack((k, k + 1)).to(nearest.dtype)[:, None]
     starts, ends = _distance(base + (offset[:, None] + edges) * pace, step, growth)
