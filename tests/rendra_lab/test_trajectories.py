@@ -219,7 +219,11 @@ def test_a_closed_way_has_no_jump_and_no_corner(tmp_path: Path) -> None:
 def test_paths_of_nerfstudio_are_understood(tmp_path: Path) -> None:
     scene = ring_scene()
     entries = [
-        {"camera_to_world": sum(opengl(scene.train.R[i], scene.train.positions[i]), []), "fov": 60, "aspect": 1.5}
+        {
+            "camera_to_world": torch.tensor(opengl(scene.train.R[i], scene.train.positions[i])).flatten().tolist(),
+            "fov": 60,
+            "aspect": 1.5,
+        }
         for i in range(3)
     ]
     content = {"camera_type": "perspective", "render_height": 20, "render_width": 30, "camera_path": entries}
