@@ -22,12 +22,14 @@ from rendra.renderer import (
     AmbientLights,
     BlendParams,
     DirectionalLights,
+    EmissionAbsorptionRaymarcher,
     FoVPerspectiveCameras,
     HardPhongShader,
     Materials,
     MeshRasterizer,
     MeshRenderer,
     MeshRendererWithFragments,
+    NDCGridRaysampler,
     OrthographicCameras,
     PerspectiveCameras,
     PointLights,
@@ -37,6 +39,8 @@ from rendra.renderer import (
     SoftSilhouetteShader,
     TexturesUV,
     TexturesVertex,
+    VolumeRenderer,
+    VolumeSampler,
     hard_rgb_blend,
     look_at_rotation,
     look_at_view_transform,
@@ -45,7 +49,7 @@ from rendra.renderer import (
 from rendra.renderer.cameras import get_world_to_view_transform
 from rendra.renderer.mesh.rasterize_meshes import pix_to_non_square_ndc
 from rendra.renderer.mesh.shader import ShaderBase
-from rendra.structures import Meshes, join_meshes_as_batch, join_meshes_as_scene
+from rendra.structures import Meshes, Volumes, join_meshes_as_batch, join_meshes_as_scene
 from rendra.transforms import (
     RotateAxisAngle,
     Transform3d,
@@ -647,3 +651,107 @@ def test_deforming_a_sphere_to_a_cloud(tmp_path):
     final_verts = final_verts * scale + center
     save_ply(tmp_path / "deform1.ply", final_verts.detach(), final_faces, ascii=True)
     assert_close(load_ply(tmp_path / "deform1.ply")[0], final_verts.detach(), atol=1e-5)
+
+
+# -- volumes
+
+
+@pytest.mark.filterwarnings("ignore:NDCGridRaysampler is deprecated")
+def test_understand_ray_sampling_volume_sampler_and_ray_marcher(tmp_path):
+    """Chapter 5: three scripts that hand tensors to each other through files."""
+    num_views = 10
+    azimuth = torch.linspace(-180, 180, num_views)
+    R, T = look_at_view_transform(dist=2.7, elev=0, azim=azimuth)
+    cameras = FoVPerspectiveCameras(device=device, R=R, T=T)
+    raysampler = NDCGridRaysampler(image_width=16, image_height=16, n_pts_per_ray=50, min_depth=0.1, max_depth=3.0)
+    ray_bundle = raysampler(cameras)
+    assert ray_bundle.origins.shape == ray_bundle.directions.shape == (10, 16, 16, 3)
+    assert ray_bundle.lengths.shape == (10, 16, 16, 50)
+    assert ray_bundle.xys.shape == (10, 16, 16, 2)
+    torch.save({"ray_bundle": ray_bundle}, tmp_path / "ray_sampling.pt")
+
+    ray_bundle = torch.load(tmp_path / "ray_sampling.pt", weights_only=False)["ray_bundle"]
+    volumes = Volumes(
+        densities=torch.zeros([num_views, 1, 16, 16, 16]),
+        features=torch.zeros([num_views, 3, 16, 16, 16]),
+        voxel_size=0.1,
+    )
+    volume_sampler = VolumeSampler(volumes=volumes, sample_mode="bilinear")
+    rays_densities, rays_features = volume_sampler(ray_bundle)
+    assert rays_densities.shape == (10, 16, 16, 50, 1)
+    assert rays_features.shape == (10, 16, 16, 50, 3)
+    torch.save({"rays_densities": rays_densities, "rays_features": rays_features}, tmp_path / "volume_sampling.pt")
+
+    checkpoint = torch.load(tmp_path / "volume_sampling.pt")
+    raymarcher = EmissionAbsorptionRaymarcher()
+    image_features = raymarcher(
+        rays_densities=checkpoint["rays_densities"], rays_features=checkpoint["rays_features"]
+    )
+    assert image_features.shape == (10, 16, 16, 4)
+    assert image_features.abs().max() == 0
+
+
+class VolumeModel(torch.nn.Module):
+    """Chapter 5: log densities and log colours, rendered for a batch of cameras."""
+
+    def __init__(self, renderer, volume_size=[16] * 3, voxel_size=3.0 / 16):
+        super().__init__()
+        self.log_densities = torch.nn.Parameter(-4.0 * torch.ones(1, *volume_size))
+        self.log_colors = torch.nn.Parameter(torch.zeros(3, *volume_size))
+        self._voxel_size = voxel_size
+        self._renderer = renderer
+
+    def forward(self, cameras):
+        batch_size = cameras.R.shape[0]
+        densities, colors = torch.sigmoid(self.log_densities), torch.sigmoid(self.log_colors)
+        volumes = Volumes(
+            densities=densities[None].expand(batch_size, *self.log_densities.shape),
+            features=colors[None].expand(batch_size, *self.log_colors.shape),
+            voxel_size=self._voxel_size,
+        )
+        return self._renderer(cameras=cameras, volumes=volumes)[0]
+
+
+def huber(x, y, scaling=0.1):
+    return ((1 + (x - y) ** 2 / scaling**2).clamp(1e-4).sqrt() - 1) * float(scaling)
+
+
+@pytest.mark.filterwarnings("ignore:NDCGridRaysampler is deprecated")
+def test_volume_render():
+    """Chapter 5: a volume is fitted to pictures and silhouettes of a red ball."""
+    torch.manual_seed(0)
+    R, T = look_at_view_transform(dist=2.7, elev=0, azim=torch.linspace(-180, 180, 9)[:8])
+    target_cameras = FoVPerspectiveCameras(device=device, R=R, T=T)
+    x = torch.linspace(1 - 1 / 24, -1 + 1 / 24, 24)
+    target_silhouettes = (x[:, None] ** 2 + x**2 < 0.4**2).float().expand(8, 24, 24)
+    target_images = target_silhouettes[..., None] * torch.tensor([1.0, 0.2, 0.1])
+    raysampler = NDCGridRaysampler(image_width=24, image_height=24, n_pts_per_ray=40, min_depth=0.1, max_depth=3.0)
+    renderer = VolumeRenderer(raysampler=raysampler, raymarcher=EmissionAbsorptionRaymarcher())
+    volume_model = VolumeModel(renderer).to(device)
+    optimizer = torch.optim.Adam(volume_model.parameters(), lr=0.1)
+    history = []
+    for iteration in range(40):
+        if iteration == 30:
+            optimizer = torch.optim.Adam(volume_model.parameters(), lr=0.01)
+        optimizer.zero_grad()
+        batch_idx = torch.randperm(len(target_cameras))[:3]
+        batch_cameras = FoVPerspectiveCameras(
+            R=target_cameras.R[batch_idx],
+            T=target_cameras.T[batch_idx],
+            znear=target_cameras.znear[batch_idx],
+            zfar=target_cameras.zfar[batch_idx],
+            aspect_ratio=target_cameras.aspect_ratio[batch_idx],
+            fov=target_cameras.fov[batch_idx],
+            device=device,
+        )
+        rendered_images, rendered_silhouettes = volume_model(batch_cameras).split([3, 1], dim=-1)
+        sil_err = huber(rendered_silhouettes[..., 0], target_silhouettes[batch_idx]).abs().mean()
+        color_err = huber(rendered_images, target_images[batch_idx]).abs().mean()
+        loss = color_err + sil_err
+        loss.backward()
+        optimizer.step()
+        history.append(loss.item())
+    assert history[-1] < 0.1 * history[0]
+    R = so3_exp_map(torch.tensor([[0.0, 0.7, 0.0]]))
+    turned = volume_model(FoVPerspectiveCameras(R=R, T=torch.tensor([[0.0, 0.0, 2.7]]), device=device))
+    assert ((turned[0, ..., 3] > 0.5) == (target_silhouettes[0] > 0.5)).float().mean() > 0.97

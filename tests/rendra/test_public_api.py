@@ -117,7 +117,9 @@ NAMES = {
         NDCGridRaysampler NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points
         ray_bundle_variables_to_ray_points""",
     "rendra.renderer.implicit.harmonic_embedding": "HarmonicEmbedding",
-    "rendra.renderer.implicit.raymarching": "AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher",
+    "rendra.renderer.implicit.raymarching": (
+        "AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher opacity_from_density"
+    ),
     "rendra.renderer.implicit.raysampling": """
         GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler NDCGridRaysampler
         NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",

@@ -20,7 +20,7 @@ SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
 _SLABS = 16  # of planes along z: what threads own in the backward pass
-_BYTES_AT_ONCE = 2**23  # of gradients of samples, on their way from rays to slabs
+_BYTES_AT_ONCE = 2**25  # of gradients of samples, on their way from rays to slabs
 
 
 class Settings(NamedTuple):
