@@ -6,6 +6,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from PIL import Image
 from scene_files import (
     FOCAL,
@@ -395,3 +396,27 @@ def test_options_of_the_box_and_the_depths(tmp_path):
 def test_options_that_cannot_be(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         NerfBlenderViews(tmp_path, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("nerf_blender", blender_folder),
+        ("transforms", transforms_folder),
+        ("colmap", lambda folder: colmap_folder(folder, binary=True)),
+        ("llff", llff_folder),
+    ],
+)
+def test_configurations_say_every_option_and_build(compose, tmp_path, name, make):
+    folder = make(tmp_path / "scene")
+    cfg = compose(tmp_path / "nerf" / "run", "task=nerf", f"data={name}", f"data.path={folder}")
+    options = OmegaConf.to_container(cfg.data, resolve=True)
+    reader = {"nerf_blender": NerfBlenderViews, "transforms": TransformsViews}
+    reader |= {"colmap": ColmapViews, "llff": LlffViews}
+    target = options.pop("_target_")
+    assert target == f"{reader[name].__module__}.{reader[name].__name__}"
+    data = reader[name](**options)
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+    assert batch.rgb.shape == (4096, 3)
+    assert (batch.farthest > batch.nearest).any()
