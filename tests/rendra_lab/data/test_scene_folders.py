@@ -1,5 +1,6 @@
 """Folders of posed images, read here by the formats' public definitions alone."""
 
+import functools
 import json
 import math
 import struct
@@ -33,6 +34,7 @@ def black_ball(radius: float = 0.08) -> Meshes:
     return Meshes([verts], [sphere.faces_packed()], TexturesVertex([torch.zeros_like(verts)]))
 
 
+@functools.cache
 def made(**settings: Any) -> Scene:
     usual: dict[str, Any] = {"image_size": [40, 48], "counts": (5, 1, 2), "antialias": 6}
     return RenderedScene(black_ball(), AmbientLights(), **(usual | settings)).load()
