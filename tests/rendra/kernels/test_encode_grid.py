@@ -28,8 +28,8 @@ def nasty_points(count, dtype=torch.float32):
     points = torch.rand(count, 3, dtype=dtype) * 1.3 - 0.15
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=dtype)] * 3)
     borders = torch.randint(0, 17, (count, 3)).to(dtype) / 16
-    far = torch.tensor([[torch.inf, 0.5, 0.5], [0.5, -torch.inf, 0.2], [1e30, -1e30, 1.0]], dtype=dtype)
-    return torch.cat([corners, far, points, borders])[:count]
+    beyond = torch.tensor([[torch.inf, 0.5, 0.5], [0.5, -torch.inf, 0.2], [1e30, -1e30, 1.0]], dtype=dtype)
+    return torch.cat([corners, beyond, points, borders])[:count]
 
 
 def smooth_points(count):
@@ -259,7 +259,7 @@ def test_chunks_of_the_reference_change_nothing(monkeypatch):
         assert_close(one, other, atol=1e-12, rtol=0)
 
 
-def test_another_device_takes_the_reference(far):
+def test_another_device_takes_the_reference(far):  # noqa: F811
     points, table, planes = torch.rand(20, 3), torch.randn(OFFSETS[-1], 2), torch.randn(3, 5, 5, 2)
     found = grid(points.to(far), table.to(far)), encode_planes(points.to(far), planes.to(far))
     assert_close(found[0].held, grid(points, table), atol=1e-5)
