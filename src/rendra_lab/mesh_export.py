@@ -38,7 +38,7 @@ class SurfaceSettings:
     """
 
     resolution: int = 256
-    level: float = 0.5
+    level: float | None = None
     color: str | None = "vertex"
     keep: float = 0.01
     smoothing: int = 0
@@ -82,7 +82,7 @@ class WrittenSurface:
         size = f"{len(self.mesh.verts_packed()):,} vertices and {len(self.mesh.faces_packed()):,} faces"
         closed = "closed" if is_watertight(self.mesh) else "NOT closed"
         return (
-            f"mesh of {size}, {closed}, {'one piece' if pieces == 1 else f'{pieces} pieces'}, in {self.seconds:.1f} s: "
+            f"mesh of {size}, {closed}, {'1 piece' if pieces == 1 else f'{pieces} pieces'}, in {self.seconds:.1f} s: "
             f"{', '.join(path.name for path in self.files)}"
         )
 

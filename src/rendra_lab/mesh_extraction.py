@@ -1,8 +1,8 @@
 """The mesh of a radiance field: its surface, without hollows and floaters, in the field's colours.
 
-The surface is where half of the light of a ray that meets it head-on is stopped (see `optical_depth`): what
-renderings show, whether the density rises to ten or to ten thousand behind it. A level of the density itself would
-lie outside of it in a dense field, and inside of it in a thin one.
+The surface is where a share of the light of a ray that meets it head-on is stopped (see `optical_depth`), whether the
+density rises to ten or to ten thousand behind it; the share is the one that gives the mesh the outlines of the field.
+A level of the density itself would lie outside of it in a dense field, and inside of it in a thin one.
 
 A vertex has the colour of the ray that comes straight at it: the one direction that is known for every point of every
 scene, and never a grazing one, where fields are worst. A colour that changes with the viewer keeps only that one.
@@ -30,6 +30,8 @@ COLORS = ("vertex", "texture", None)
 FACES_OF_A_TEXTURED_MESH = 20_000  # charts of more faces are too many for an image
 _SPARE = 3  # faces before a decimation for each one after it: enough to choose from, few enough to be quick
 _WINDOW = (1.5, -1.0)  # voxels along the normal between which a vertex may settle
+_SKIN = 0.025  # of the box, if that is more: how soft the skin of a body may be
+_SAMPLES = 10
 _BISECTIONS = 3
 _LOOKS = (0.75, 0.0, -0.75, -1.5)  # voxels above a point of the surface where its colour is gathered
 _MATTERS = 0.02  # of a ray's light: what is stopped where less is has no visible colour
@@ -39,7 +41,7 @@ _MATTERS = 0.02  # of a ray's light: what is stopped where less is has no visibl
 def extract_mesh(
     scene: RadianceScene,
     resolution: int = 256,
-    level: float = 0.5,
+    level: float | None = None,
     color: str | None = "vertex",
     *,
     keep: float = 0.01,
@@ -54,7 +56,8 @@ def extract_mesh(
         scene: what answers about points.
         resolution: voxels along the longest side of its box; the density is asked for near the surface alone.
         level: share of the light of a head-on ray that is stopped before the surface, in (0, 1). Of a body that a
-            straight ray passes with more than (1 - level)^2 of its light, nothing is found.
+            straight ray passes with more than (1 - level)^2 of its light, nothing is found. None: the one at which
+            the mesh has the outlines of the field (`rendra_lab.optical_depth.silhouette_level`).
         color: `vertex` for colours at the vertices, `texture` for an image of `texture_size` texels a side,
             None for neither.
         keep: components with fewer faces than this share of the largest one's are floaters, and left out;
@@ -75,15 +78,15 @@ def extract_mesh(
     box = scene.box.detach().float()
     spacing = float((box[1] - box[0]).amax()) / resolution
     density = density_of(scene, spacing)
-    light = light_from_outside(density, box, resolution, 1 - level, viewpoints)
+    light = light_from_outside(density, box, resolution, None if level is None else 1 - level, viewpoints)
     if num_faces is None and color == "texture":
         num_faces = FACES_OF_A_TEXTURED_MESH
-    mesh = _without_floaters(_isosurface(light, 1 - level, num_faces), keep)
+    mesh = _without_floaters(_isosurface(light, num_faces), keep)
     if not len(mesh.faces_packed()):
         return mesh
-    mesh = _settle(mesh, density, light, 1 - level)
+    mesh = _settle(mesh, density, light)
     if num_faces is not None and len(mesh.faces_packed()) > num_faces:
-        mesh = _settle(_decimate(mesh, num_faces), density, light, 1 - level)
+        mesh = _settle(_decimate(mesh, num_faces), density, light)
     if smoothing:
         mesh = taubin_smoothing(mesh, num_iter=smoothing)
     return paint_mesh(mesh, scene, spacing, color, texture_size)
@@ -127,11 +130,11 @@ def paint_mesh(
     return Meshes(mesh.verts_list(), mesh.faces_list(), TexturesUV([maps], [faces_uvs], [uvs]))
 
 
-def _check(resolution: int, level: float, color: str | None, keep: float, num_faces: int | None) -> None:
+def _check(resolution: int, level: float | None, color: str | None, keep: float, num_faces: int | None) -> None:
     if not 8 <= resolution <= 1024:
         raise UserError(f"resolution is a number of voxels from 8 to 1024, got {resolution!r}")
-    if not 0 < level < 1:
-        raise UserError(f"level is a share of light between 0 and 1, got {level!r}")
+    if level is not None and not 0 < level < 1:
+        raise UserError(f"level is a share of light between 0 and 1, or null, got {level!r}")
     if color not in COLORS:
         raise UserError(f"color must be vertex, texture or null, got {color!r}")
     if not 0 <= keep <= 1:
@@ -140,9 +143,9 @@ def _check(resolution: int, level: float, color: str | None, keep: float, num_fa
         raise UserError(f"num_faces must be at least 100, or null for all, got {num_faces!r}")
 
 
-def _isosurface(light: LightFromOutside, level: float, num_faces: int | None) -> Meshes:
-    """Where the light has a level; on every second, third ... point only, where few faces are wanted."""
-    lattice = light.lattice
+def _isosurface(light: LightFromOutside, num_faces: int | None) -> Meshes:
+    """Where the light has its level, but no skin of what lets most light through; on every second, third ... point only, where few faces are wanted."""
+    lattice, level = light.lattice, light.core
     dark = light.light < level
     if not dark.any():
         return Meshes([lattice.low.new_zeros(0, 3)], [torch.zeros(0, 3, dtype=torch.int64, device=dark.device)])
@@ -191,14 +194,16 @@ def _decimate(mesh: Meshes, num_faces: int) -> Meshes:
     return Meshes([few_verts.to(verts.dtype)], [few_faces])
 
 
-def _settle(mesh: Meshes, density: Density, light: LightFromOutside, level: float) -> Meshes:
+def _settle(mesh: Meshes, density: Density, light: LightFromOutside) -> Meshes:
     """The mesh with each vertex moved along its normal to where the light of a ray that comes in has the level.
 
-    A vertex whose ray does not reach the level near it stays.
+    A ray begins where it is clearest, so that neither haze nor another part of the body darkens it. A vertex whose ray
+    does not reach the level near it stays.
     """
     verts, normals = mesh.verts_packed(), mesh.verts_normals_packed()
     spacing = light.lattice.spacing
-    steps = torch.linspace(*_WINDOW, 6, device=verts.device) * spacing
+    outer = max(_WINDOW[0] * spacing, _SKIN * (max(light.lattice.shape) - 3) * spacing)
+    steps = torch.linspace(outer, _WINDOW[1] * spacing, _SAMPLES, device=verts.device)
 
     def density_along(heights: Tensor) -> Tensor:
         """(V, S) at heights (V, S) above the vertices."""
@@ -207,10 +212,12 @@ def _settle(mesh: Meshes, density: Density, light: LightFromOutside, level: floa
 
     heights = steps.expand(len(verts), -1)
     sigma = density_along(heights)
-    start = -torch.log(light.at(verts + steps[0] * normals).clamp_min(1e-9))
+    above = int((steps >= 0).sum())
+    clearest = above - 1 - sigma[:, :above].flip(1).argmin(1)
+    sigma = torch.where(torch.arange(_SAMPLES, device=verts.device) < clearest[:, None], 0, sigma)
     gained = (sigma[:, 1:] + sigma[:, :-1]) / 2 * (steps[0] - steps[1])
-    depth = start[:, None] + torch.cat([torch.zeros_like(start)[:, None], gained.cumsum(1)], 1)
-    wanted = -math.log(level)
+    depth = torch.cat([torch.zeros_like(sigma[:, :1]), gained.cumsum(1)], 1)
+    wanted = -math.log(light.level)
     reached = depth >= wanted
     behind = reached.to(torch.int8).argmax(1)
     settles = reached.any(1) & (behind > 0)

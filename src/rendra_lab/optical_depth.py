@@ -5,8 +5,12 @@ The depth of a point is the least optical depth of any path that leads to it fro
     tau(x) = min over paths of the integral of sigma along the path,    |grad tau| = sigma,    tau = 0 outside,
 
 and exp(-tau) is the share of light that comes through. Straight into a body the clearest path runs along the normal,
-so the level exp(-tau) = 1/2 is where half of the light of a ray that meets the surface head-on is stopped: what
-photographs fix, however dense the field is behind it. Hollows that no light enters are deep, not empty.
+so a level of exp(-tau) is where so much of the light of a ray that meets the surface head-on is left, however dense
+the field is behind it. Hollows that no light enters are deep, not empty.
+
+Photographs fix outlines: where half of the light of a ray that grazes a body is stopped. Such a ray stays long in the
+soft skin of a fitted body, so that one that comes head-on has most of its light left as deep as that. How much, the
+field itself says: `silhouette_level`. For a hard surface all levels are in one place.
 
 The eikonal equation is solved with Godunov's upwind differences (Rouy & Tourin, "A viscosity solutions approach to
 shape-from-shading", 1992) on a coarse lattice, then on finer ones near the surface alone.
@@ -26,27 +30,34 @@ from rendra_lab.networks.radiance import RadianceScene
 
 COARSEST = 80  # cells along the longest side, at most, of the lattice that is filled everywhere
 _POINTS_AT_ONCE = 1 << 17
-_BEYOND = 5.0  # optical depth behind the wanted one at which a path is followed no further
+_DEEPEST = 7.0  # optical depth at which a path is followed no further
+_CORE = 0.5  # of light: what nowhere stops more is haze, no body
+_HAZE = 1.0  # optical depth: matter of which the whole box would be no deeper is no body
+_LEVELS = (0.3, 0.97)  # of light, that a silhouette may ask for
 _FAINT = 0.1  # of the wanted depth: matter of a cell that may be more, seen closely
 
 Density = Callable[[Tensor], Tensor]
 
 
 def density_of(scene: RadianceScene, step: float) -> Density:
-    """The density (M,), 1/length, of points (M, 3): of matter as opaque as a step of the scene; 0 out of its box.
+    """The density (M,), 1/length, of points (M, 3): of matter as opaque as a step of the scene.
+
+    It is 0 out of the box, and in haze: where a box full of such matter would let more than 1 / e of the light through.
 
     Args:
         scene: to ask.
         step: thickness by which the scene is asked for opacities, in world units.
     """
     low, high = scene.box
+    haze = _HAZE / float((high - low).amax())
 
     def density(points: Tensor) -> Tensor:
         found = points.new_zeros(len(points))
         inside = ((points >= low) & (points <= high)).all(1).nonzero()[:, 0]
         for rows in inside.split(_POINTS_AT_ONCE):
             opacity = scene.opacity_at(points.index_select(0, rows), step).to(points.dtype)
-            found[rows] = -torch.log1p(-opacity.nan_to_num(0.0).clamp(0, 1 - 1e-7)) / step
+            sigma = -torch.log1p(-opacity.nan_to_num(0.0).clamp(0, 1 - 1e-7)) / step
+            found[rows] = torch.where(sigma < haze, 0, sigma)
         return found
 
     return density
@@ -110,23 +121,23 @@ class LightFromOutside:
 
     Attributes:
         lattice: the points.
-        light: (x, y, z) in [0, 1]; right near the level that was asked for, elsewhere on the right side of it.
+        light: (x, y, z) in [0, 1]; right near the core's level, elsewhere on the right side of it.
+        level: in (0, 1), of the surface.
     """
 
     lattice: Lattice
     light: Tensor
+    level: float
 
-    def at(self, points: Tensor) -> Tensor:
-        """The light at points (M, 3), trilinear: (M,)."""
-        size = torch.tensor(self.lattice.shape, device=points.device, dtype=points.dtype) - 1
-        places = (points - self.lattice.low) / self.lattice.spacing / size * 2 - 1
-        volume = self.light.permute(2, 1, 0)[None, None]  # grid_sample counts x along the last axis
-        return F.grid_sample(volume, places.view(1, 1, 1, -1, 3), padding_mode="border", align_corners=True).view(-1)
+    @property
+    def core(self) -> float:
+        """The level of what is surely a body: half, or that of the surface if that is less."""
+        return min(self.level, _CORE)
 
 
 @torch.no_grad()
 def light_from_outside(
-    density: Density, box: Tensor, resolution: int, level: float = 0.5, viewpoints: Tensor | None = None
+    density: Density, box: Tensor, resolution: int, level: float | None = None, viewpoints: Tensor | None = None
 ) -> LightFromOutside:
     """Solves for the light on a lattice of `resolution` cells along the longest side of a box, exactly near a level.
 
@@ -134,40 +145,57 @@ def light_from_outside(
         density: 1/length of points (M, 3), see `density_of`.
         box: (2, 3) around all matter.
         resolution: cells along its longest side.
-        level: the share of light, in (0, 1), near which the answer has to be right.
+        level: the share of light, in (0, 1), near which the answer has to be right; None: see `silhouette_level`.
         viewpoints: (P, 3) further places that light comes from, such as cameras within the box.
     """
     spacing = float((box[1] - box[0]).amax()) / resolution
     halvings = max(0, math.ceil(math.log2(resolution / COARSEST)))
     lattice = Lattice.around(box, spacing * 2**halvings)
-    wanted = -math.log(level)
     depth = torch.full(lattice.shape, torch.inf, device=box.device)
     rows = (~lattice.rim()).flatten().nonzero()[:, 0]
-    faint = _solve(density, lattice, depth, rows, wanted, viewpoints)
+    matter = _solve(density, lattice, depth, rows, viewpoints)
+    if level is None:
+        level = silhouette_level(depth, matter)
+    wanted = -math.log(min(level, _CORE))
     for _ in range(halvings):
-        marked = _near_surface(depth, faint, wanted)
+        marked = _near_surface(depth, matter > _FAINT * wanted, wanted)
         lattice, depth, rows = _divide(lattice, depth, marked, wanted)
-        faint = _solve(density, lattice, depth, rows, wanted, viewpoints)
-    return LightFromOutside(lattice, torch.exp(-depth))
+        matter = _solve(density, lattice, depth, rows, viewpoints)
+    return LightFromOutside(lattice, torch.exp(-depth), level)
 
 
-def _solve(
-    density: Density, lattice: Lattice, depth: Tensor, rows: Tensor, wanted: float, viewpoints: Tensor | None
-) -> Tensor:
+def silhouette_level(depth: Tensor, matter: Tensor) -> float:
+    """The level at which a surface has the outline that the field shows, in area, seen along x, y and z from afar.
+
+    The field covers a pixel where it stops more than half of the light there; the surface of a level does where any
+    point on the ray has less light than it. As many pixels are covered either way.
+
+    Args:
+        depth: (x, y, z) optical depth of a lattice's points.
+        matter: (x, y, z) the part of it between neighbours.
+    """
+    light = torch.exp(-(depth - matter / 2).clamp_min(0))  # a point's own matter is half behind it
+    covered = torch.cat([(matter.sum(axis) > math.log(2)).flatten() for axis in range(3)])
+    least = torch.cat([light.amin(axis).flatten() for axis in range(3)]).sort().values
+    count = int(covered.sum())
+    if count == 0:
+        return 0.5
+    return float(least[count - 1 : count + 1].mean().clamp(*_LEVELS))
+
+
+def _solve(density: Density, lattice: Lattice, depth: Tensor, rows: Tensor, viewpoints: Tensor | None) -> Tensor:
     """Finds the depth (x, y, z) of the points in `rows`, in place, from the others, which are known.
 
     Returns:
-        Which points hold matter that is faint but not nothing: (x, y, z) bool.
+        The optical depth of the matter between neighbours, 0 at the points that are known: (x, y, z).
     """
     depth[lattice.rim()] = 0
     flat = depth.view(-1)
     if viewpoints is not None:
         flat[lattice.nearest(viewpoints.to(flat))] = 0
     matter = density(lattice.points(rows)) * lattice.spacing
-    faint = torch.zeros_like(flat, dtype=torch.bool)
-    faint[rows[matter > _FAINT * wanted]] = True
-    _relax(flat, lattice.strides, rows, matter, wanted + _BEYOND)
-    return faint.view_as(depth)
+    _relax(flat, lattice.strides, rows, matter, _DEEPEST)
+    return torch.zeros_like(flat).index_copy(0, rows, matter).view_as(depth)
 
 
 def _relax(flat: Tensor, strides: tuple[int, int, int], rows: Tensor, matter: Tensor, deepest: float) -> None:

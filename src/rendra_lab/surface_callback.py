@@ -37,7 +37,7 @@ class SurfaceExporter(Callback):
         self,
         folder: str,
         resolution: int = 128,
-        level: float = 0.5,
+        level: float | None = None,
         color: str | None = "vertex",
         keep: float = 0.01,
         smoothing: int = 0,

