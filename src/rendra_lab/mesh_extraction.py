@@ -144,7 +144,7 @@ def _check(resolution: int, level: float | None, color: str | None, keep: float,
 
 
 def _isosurface(light: LightFromOutside, num_faces: int | None) -> Meshes:
-    """Where the light has its level, but no skin of what lets most light through; on every second, third ... point only, where few faces are wanted."""
+    """Where the light has the level of the core; of every second, third ... point, where few faces are wanted."""
     lattice, level = light.lattice, light.core
     dark = light.light < level
     if not dark.any():
@@ -197,8 +197,8 @@ def _decimate(mesh: Meshes, num_faces: int) -> Meshes:
 def _settle(mesh: Meshes, density: Density, light: LightFromOutside) -> Meshes:
     """The mesh with each vertex moved along its normal to where the light of a ray that comes in has the level.
 
-    A ray begins where it is clearest, so that neither haze nor another part of the body darkens it. A vertex whose ray
-    does not reach the level near it stays.
+    A ray begins where it is clearest, so that neither haze nor another part of the body darkens it. A vertex whose
+    ray does not reach the level near it stays.
     """
     verts, normals = mesh.verts_packed(), mesh.verts_normals_packed()
     spacing = light.lattice.spacing

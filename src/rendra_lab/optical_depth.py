@@ -33,7 +33,7 @@ _POINTS_AT_ONCE = 1 << 17
 _DEEPEST = 7.0  # optical depth at which a path is followed no further
 _CORE = 0.5  # of light: what nowhere stops more is haze, no body
 _HAZE = 1.0  # optical depth: matter of which the whole box would be no deeper is no body
-_LEVELS = (0.3, 0.97)  # of light, that a silhouette may ask for
+_LEVELS = (0.3, 0.99)  # of light, that a silhouette may ask for
 _FAINT = 0.1  # of the wanted depth: matter of a cell that may be more, seen closely
 
 Density = Callable[[Tensor], Tensor]
@@ -42,7 +42,7 @@ Density = Callable[[Tensor], Tensor]
 def density_of(scene: RadianceScene, step: float) -> Density:
     """The density (M,), 1/length, of points (M, 3): of matter as opaque as a step of the scene.
 
-    It is 0 out of the box, and in haze: where a box full of such matter would let more than 1 / e of the light through.
+    It is 0 out of the box, and in haze: where a box full of such matter would let 1 / e of the light through.
 
     Args:
         scene: to ask.
