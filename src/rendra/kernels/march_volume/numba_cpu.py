@@ -17,6 +17,7 @@ from rendra.kernels.march_volume.lanes import add_scaled, dot, gather, load, mul
 from rendra.kernels.parallel import inlined_kernel, num_threads, parallel_kernel, scalar_kernel
 
 SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
+_FAR = np.float32(1e30)
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
 _SLABS = 16  # of planes along z: what threads own in the backward pass
@@ -176,7 +177,7 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
     first, place = _first(m, settings, lanes), r * samples
     wanted = load(upstream, m * count, lanes)
     planes = (settings.depth + _SLABS - 1) // _SLABS
-    left, entry, slab = ONE, 0, -1
+    left, entry, slab, low, high = ONE, 0, -1, ZERO, ZERO
     k, end = _span(rays, m, settings)
     while k < end and not abs(left) < settings.stop_below:
         i = np.float32(k)
@@ -194,9 +195,10 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
         store(asked, (place + entry) * count, pull)
         trail[entry], trail[samples + entry] = alpha, left * slope
         trail[2 * samples + entry] = dot(wanted, values) + of_scalars[2 * m + 1] * (begin + i * step)
-        here = min(max(_floor(z), 0), settings.depth - 1) // planes
-        if here != slab:
-            slab = here
+        if slab < 0 or z < low or z >= high:
+            slab = min(max(_floor(z), 0), settings.depth - 1) // planes
+            low = np.float32(slab * planes) if slab > 0 else -_FAR
+            high = np.float32((slab + 1) * planes) if (slab + 1) * planes < settings.depth else _FAR
             pieces[2 * (_SLABS * r + slab)] = np.int32(entry)
         steps[place + entry] = np.int32(k)
         entry += 1
@@ -214,27 +216,37 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
 def _spread(rays, m, settings, lanes, cell, notes, r, slab, grad):
     """Add the piece of a ray that is in a slab to its voxels."""
     asked, steps, pieces, _ = notes
-    count, place = len(lanes), r * settings.samples
     begin, end = pieces[2 * (_SLABS * r + slab)], pieces[2 * (_SLABS * r + slab) + 1]
+    if begin == end:
+        return
+    count, place = len(lanes), r * settings.samples
     row, plane, first = settings.width * count, settings.height * settings.width * count, _first(m, settings, lanes)
     px, py, pz, dx, dy, dz, _, _, _ = _ray(rays, m)
     for entry in range(begin, end):
         i = np.float32(steps[place + entry])
         x, y, z = px + i * dx, py + i * dy, pz + i * dz
-        ix, iy, iz = _floor(x), _floor(y), _floor(z)
-        fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
         values = load(asked, (place + entry) * count, lanes)
-        if _is_inside(ix, iy, iz, settings):
-            scatter(grad, first + iz * plane + iy * row + ix * count, row, plane, fx, fy, fz, values)
-            continue
-        for c in range(8 * count):
-            cell[c] = ZERO
-        scatter(cell, 0, 2 * count, 4 * count, fx, fy, fz, values)
-        for corner in range(8):
-            at = _corner(corner, ix, iy, iz, settings)
-            if at >= 0:
-                for c in range(count):
-                    grad[first + at * count + c] += cell[corner * count + c]
+        if _is_between(x, y, z, settings):
+            ix, iy, iz = int(x), int(y), int(z)
+            at = first + iz * plane + iy * row + ix * count
+            fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
+            scatter(grad, at, row, plane, fx, fy, fz, values)
+        else:
+            _spread_at_border(grad, first, x, y, z, settings, values, cell)
+
+
+@scalar_kernel
+def _spread_at_border(grad, first, x, y, z, settings, values, cell):
+    count = len(values)
+    ix, iy, iz = _floor(x), _floor(y), _floor(z)
+    for c in range(8 * count):
+        cell[c] = ZERO
+    scatter(cell, 0, 2 * count, 4 * count, x - np.float32(ix), y - np.float32(iy), z - np.float32(iz), values)
+    for corner in range(8):
+        at = _corner(corner, ix, iy, iz, settings)
+        if at >= 0:
+            for c in range(count):
+                grad[first + at * count + c] += cell[corner * count + c]
 
 
 @inlined_kernel
@@ -262,25 +274,34 @@ def _floor(x):
 @inlined_kernel
 def _read(grid, first, x, y, z, settings, lanes, cell):
     """The lanes at a point; voxels outside count as 0."""
+    if not _is_between(x, y, z, settings):
+        return _read_at_border(grid, first, x, y, z, settings, lanes, cell)
     count = len(lanes)
     row, plane = settings.width * count, settings.height * settings.width * count
-    ix, iy, iz = _floor(x), _floor(y), _floor(z)
+    ix, iy, iz = int(x), int(y), int(z)
     fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
-    if _is_inside(ix, iy, iz, settings):
-        return gather(grid, first + iz * plane + iy * row + ix * count, row, plane, fx, fy, fz, lanes)
+    return gather(grid, first + iz * plane + iy * row + ix * count, row, plane, fx, fy, fz, lanes)
+
+
+@scalar_kernel
+def _read_at_border(grid, first, x, y, z, settings, lanes, cell):
+    count = len(lanes)
+    ix, iy, iz = _floor(x), _floor(y), _floor(z)
     for corner in range(8):
         at = _corner(corner, ix, iy, iz, settings)
         for c in range(count):
             cell[corner * count + c] = grid[first + at * count + c] if at >= 0 else ZERO
+    fx, fy, fz = x - np.float32(ix), y - np.float32(iy), z - np.float32(iz)
     return gather(cell, 0, 2 * count, 4 * count, fx, fy, fz, lanes)
 
 
 @inlined_kernel
-def _is_inside(ix, iy, iz, settings):
-    """Whether all 8 voxels of a cell exist."""
+def _is_between(x, y, z, settings):
+    """Whether all 8 voxels around a point exist."""
     return (
-        ix >= 0 and iy >= 0 and iz >= 0
-        and ix < settings.width - 1 and iy < settings.height - 1 and iz < settings.depth - 1
+        min(x, min(y, z)) >= ZERO
+        and x < np.float32(settings.width - 1) and y < np.float32(settings.height - 1)
+        and z < np.float32(settings.depth - 1)
     )  # fmt: skip
 
 
