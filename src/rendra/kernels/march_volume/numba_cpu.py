@@ -20,7 +20,7 @@ SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
 _FAR = np.float32(1e30)
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
-_SLABS = 16  # of planes along z: what threads own in the backward pass
+_SLABS = 8  # of planes along z: what threads own in the backward pass
 _BYTES_AT_ONCE = 2**25  # of gradients of samples, on their way from rays to slabs
 
 
@@ -212,7 +212,7 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
         behind += trail[j] * gain
 
 
-@scalar_kernel
+@inlined_kernel
 def _spread(rays, m, settings, lanes, cell, notes, r, slab, grad):
     """Add the piece of a ray that is in a slab to its voxels."""
     asked, steps, pieces, _ = notes
