@@ -18,6 +18,7 @@ from rendra.kernels.parallel import inlined_kernel, num_threads, parallel_kernel
 
 SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
 _FAR = np.float32(1e30)
+_MANY = np.float32(1 << 20)
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
 _SLABS = 8  # of planes along z: what threads own in the backward pass
@@ -116,11 +117,12 @@ def _look(inputs, m, settings, lanes, cell):
     first = _first(m, settings, lanes)
     faint = max(settings.stop_below, _NOTHING)
     total, left, depth = lanes, ONE, ZERO
+    cells = _in_cells(dx, dy, dz, settings)
     k, end = _span(rays, m, settings)
     while k < end and not abs(left) < faint:
         i = np.float32(k)
         x, y, z = px + i * dx, py + i * dy, pz + i * dz
-        empty = _empty_steps(x, y, z, dx, dy, dz, occupancy, settings)
+        empty = _empty_steps(x, y, z, cells, occupancy, settings)
         if empty > 0:
             k += empty
             continue
@@ -178,11 +180,12 @@ def _look_back(inputs, m, settings, lanes, cell, upstreams, notes, r):
     wanted = load(upstream, m * count, lanes)
     planes = (settings.depth + _SLABS - 1) // _SLABS
     left, entry, slab, low, high = ONE, 0, -1, ZERO, ZERO
+    cells = _in_cells(dx, dy, dz, settings)
     k, end = _span(rays, m, settings)
     while k < end and not abs(left) < settings.stop_below:
         i = np.float32(k)
         x, y, z = px + i * dx, py + i * dy, pz + i * dz
-        empty = _empty_steps(x, y, z, dx, dy, dz, occupancy, settings)
+        empty = _empty_steps(x, y, z, cells, occupancy, settings)
         if empty > 0:
             k += empty
             continue
@@ -343,37 +346,53 @@ def _span(rays, m, settings):
 
 
 @inlined_kernel
-def _empty_steps(x, y, z, dx, dy, dz, occupancy, settings):
+def _empty_steps(x, y, z, cells, occupancy, settings):
     """How many steps from a sample are surely empty; 0 if it counts."""
-    width, height, depth = settings.width - 1, settings.height - 1, settings.depth - 1
     if settings.is_bounded and not (
-        x >= ZERO and y >= ZERO and z >= ZERO
-        and x <= np.float32(width) and y <= np.float32(height) and z <= np.float32(depth)
+        min(x, min(y, z)) >= ZERO
+        and x <= np.float32(settings.width - 1) and y <= np.float32(settings.height - 1)
+        and z <= np.float32(settings.depth - 1)
     ):  # fmt: skip
         return 1
     if settings.cells_depth == 0:
         return 0
-    ix, sx = _cell_along(x, dx, width, settings.cells_width)
-    iy, sy = _cell_along(y, dy, height, settings.cells_height)
-    iz, sz = _cell_along(z, dz, depth, settings.cells_depth)
-    if occupancy[(iz * settings.cells_height + iy) * settings.cells_width + ix] != 0:
+    u, v, w = x * cells[0], y * cells[1], z * cells[2]
+    i = min(max(_floor(u), 0), settings.cells_width - 1)
+    j = min(max(_floor(v), 0), settings.cells_height - 1)
+    k = min(max(_floor(w), 0), settings.cells_depth - 1)
+    if occupancy[(k * settings.cells_height + j) * settings.cells_width + i] != 0:
         return 0
-    return max(1, int(min(sx, min(sy, sz))))
+    steps = min(
+        _steps_to_border(u, i, settings.cells_width, cells[3]),
+        min(
+            _steps_to_border(v, j, settings.cells_height, cells[4]),
+            _steps_to_border(w, k, settings.cells_depth, cells[5]),
+        ),
+    )
+    return max(1, int(steps))
 
 
 @inlined_kernel
-def _cell_along(x, dx, last, count):
-    """The cell of the occupancy around x, and the steps up to its end, within reason."""
-    many = np.float32(1 << 20)
-    if last == 0:
-        return 0, many
-    scale = np.float32(count) / np.float32(last)
-    u, du = x * scale, dx * scale
-    i = min(max(_floor(u), 0), count - 1)
-    if du == ZERO or (du > ZERO and i == count - 1) or (du < ZERO and i == 0):
-        return i, many
-    border = np.float32(i + 1) if du > ZERO else np.float32(i)
-    return i, min(max((border - u) / du, ZERO), many)
+def _in_cells(dx, dy, dz, settings):
+    """Cells of the occupancy a voxel along each axis, and steps a cell; 0 where there is no motion."""
+    sx = np.float32(settings.cells_width) / np.float32(max(settings.width - 1, 1))
+    sy = np.float32(settings.cells_height) / np.float32(max(settings.height - 1, 1))
+    sz = np.float32(settings.cells_depth) / np.float32(max(settings.depth - 1, 1))
+    return sx, sy, sz, _inverse(dx * sx), _inverse(dy * sy), _inverse(dz * sz)
+
+
+@inlined_kernel
+def _inverse(x):
+    return ONE / x if x != ZERO else ZERO
+
+
+@inlined_kernel
+def _steps_to_border(u, i, count, steps_a_cell):
+    """Steps from u to the end of its cell i; the outermost cells have none outwards."""
+    if steps_a_cell == ZERO or i == (count - 1 if steps_a_cell > ZERO else 0):
+        return _MANY
+    border = np.float32(i + 1) if steps_a_cell > ZERO else np.float32(i)
+    return min(max((border - u) * steps_a_cell, ZERO), _MANY)
 
 
 @inlined_kernel

@@ -13,7 +13,6 @@ A sample in an empty cell of the occupancy has a_j = 0, and so has one with T_j 
 finite sees NaN.
 """
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -125,7 +124,7 @@ def _zeros(grid: Tensor, shape: tuple[int, ...]) -> Tensor:
 def _is_occupied(occupancy: Tensor, grid: Tensor, points: Tensor) -> Tensor:
     """Whether the cell of the occupancy that holds a point, or lies nearest to it, is occupied. (R, S)"""
     count = torch.tensor(occupancy.shape[::-1], device=points.device)
-    cells = (points * (count / _last(grid).clamp(min=math.ulp(1.0)))).floor()
+    cells = (points * (count / _last(grid).clamp(min=1))).floor()
     x, y, z = torch.minimum(cells.clamp(min=0).long(), count - 1).unbind(-1)
     return occupancy[z, y, x] != 0
 

@@ -162,4 +162,4 @@ def _root(grids: Tensor) -> Tensor | None:
 
 def _interleaved(grids: list[Tensor]) -> Tensor:
     """Channels last, side by side for each voxel."""
-    return torch.cat(grids, dim=1).movedim(1, -1).contiguous()
+    return torch.cat([each.movedim(1, -1) for each in grids], dim=-1).contiguous()
