@@ -106,7 +106,7 @@ VOLUMES: tuple[Benchmark, ...] = (
         is_public=False,
     ),
     Benchmark(
-        "march_volume_sparse", "the same where 2 % of the box is occupied", _march(4, backward=True, is_sparse=True),
+        "march_volume_sparse", "the same where 5 % of the box is occupied", _march(4, backward=True, is_sparse=True),
         _MARCH, is_public=False,
     ),
     Benchmark(
