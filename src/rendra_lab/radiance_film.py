@@ -36,7 +36,7 @@ def path_caster(data: SceneViews) -> RayCaster:
     """Makes rays as the data does, over one background for all frames: white, where training draws it at random."""
     background = "white" if data.background == "random" else data.background
     scene = data.scene
-    return RayCaster(scene.box, scene.depth_range, background, data.rays_per_pixel_side, scene.warp)
+    return RayCaster(scene.box, scene.depth_range, background, data.final_side, scene.warp)
 
 
 def render_path(

@@ -12,7 +12,7 @@ from rendra_lab.experiment import run
 CONF = Path(__file__).parents[2] / "conf"
 
 # a step of these takes a laptop minutes
-_TINY = ("data.image_size=16", "data.pixels_per_step=12", "field.width=16", "callbacks.turntable.frames=0")
+_TINY = ("data.image_size=16", "data.rays_per_step=12", "field.width=16", "callbacks.turntable.frames=0")
 SMALLER = {
     "nerf_book": (*_TINY, "sampler.samples=4"),
     "nerf_book_laptop": (*_TINY, "sampler.samples=4"),

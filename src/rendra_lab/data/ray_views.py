@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
+from torch.nn import functional as F
 
 from rendra.structures import Meshes
 from rendra_lab.data.posed_images import PosedImages
@@ -23,6 +24,7 @@ from rendra_lab.records import TensorRecord
 RayWarp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Takes rays, origins (Q, 3) and unit directions (Q, 3), to those of a bent space: the same shapes and lengths."""
 
+_FOCUS_MARGIN_PX = 3
 BACKGROUNDS = {"white": 1.0, "black": 0.0, "random": None}
 
 
@@ -96,7 +98,7 @@ class RayCaster:
         Args:
             images: to look at.
             chosen: (R,) int64.
-            generator: of random backgrounds and jitter; None uses grey instead of random backgrounds.
+            generator: of random backgrounds and jitter; None uses white instead of random backgrounds.
             jitter: move each ray to a random place of its part of the pixel.
         """
         view = torch.searchsorted(images.first_pixel, chosen, right=True) - 1
@@ -140,7 +142,7 @@ class RayCaster:
         value = BACKGROUNDS[self.background]
         if value is not None:
             return torch.full((count, 3), value)
-        return torch.full((count, 3), 0.5) if generator is None else torch.rand(count, 3, generator=generator)
+        return torch.ones(count, 3) if generator is None else torch.rand(count, 3, generator=generator)
 
     def _batch(self, rgba: Tensor, behind: Tensor, origins: Tensor, directions: Tensor) -> RayBatch:
         origins, directions = (rays.reshape(len(rgba), -1, 3) for rays in (origins, directions))
@@ -167,14 +169,16 @@ class RandomPixels:
     """
 
     def __init__(
-        self, caster: RayCaster, images: PosedImages, pixels: int, steps: int, seed: int, **how: Any
+        self, casters: Callable[[int], RayCaster], images: PosedImages, rays: int, steps: int, seed: int, **how: Any
     ) -> None:
-        self.caster, self.images = caster, images
-        self.num_pixels, self.steps, self.seed = pixels, steps, seed
+        self.casters, self.images = casters, images
+        self.num_rays, self.steps, self.seed = rays, steps, seed
         self.views_per_step: int | None = how["views_per_step"]
         self.precrop: float = how["precrop"]
         self.precrop_steps: int = how["precrop_steps"]
         self.jitter: bool = how["jitter"]
+        self.focus: float = how["focus"] if images.has_alpha and self.views_per_step is None else 0.0
+        self._near = pixels_near_matter(images) if self.focus > 0 else torch.zeros(0, dtype=torch.int32)
         self._next = 0
 
     def __len__(self) -> int:
@@ -196,11 +200,11 @@ class RandomPixels:
 
     def _batch(self, step: int) -> RayBatch:
         generator = torch.Generator().manual_seed((self.seed << 32) + step)
-        chosen = self._chosen(step, generator)
-        return self.caster.pixels(self.images, chosen, generator, self.jitter)
+        caster = self.casters(step)
+        chosen = self._chosen(step, max(1, self.num_rays // caster.side**2), generator)
+        return caster.pixels(self.images, chosen, generator, self.jitter)
 
-    def _chosen(self, step: int, generator: torch.Generator) -> Tensor:
-        count = self.num_pixels
+    def _chosen(self, step: int, count: int, generator: torch.Generator) -> Tensor:
         views = torch.arange(len(self.images))
         if self.views_per_step is not None:
             views = torch.randperm(len(views), generator=generator)[: self.views_per_step]
@@ -209,7 +213,23 @@ class RandomPixels:
         inside = (1 - share) / 2 + share * torch.rand(count, 2, generator=generator)
         size = self.images.sizes[view]
         row, column = (inside * size).long().minimum(size - 1).unbind(1)
-        return self.images.first_pixel[view] + row * size[:, 1] + column
+        chosen = self.images.first_pixel[view] + row * size[:, 1] + column
+        if step >= self.precrop_steps and len(self._near) > 0:
+            focused = round(self.focus * count)
+            chosen[:focused] = self._near[torch.randint(len(self._near), (focused,), generator=generator)].long()
+        return chosen
+
+
+def pixels_near_matter(images: PosedImages) -> Tensor:
+    """Pixels (M,) int32, counted through all images, within `_FOCUS_MARGIN_PX` of one that is not transparent."""
+    near = []
+    for index, first in enumerate(images.first_pixel[:-1].tolist()):
+        height, width = images.sizes[index].tolist()
+        alpha = images.pixels[first : first + height * width, 3].reshape(1, 1, height, width) > 0
+        reach = 2 * _FOCUS_MARGIN_PX + 1
+        grown = F.max_pool2d(alpha.float(), reach, stride=1, padding=_FOCUS_MARGIN_PX)
+        near.append((first + grown.flatten().nonzero()[:, 0]).int())
+    return torch.cat(near) if near else torch.zeros(0, dtype=torch.int32)
 
 
 class WholeViews:
@@ -230,26 +250,30 @@ class SceneViews(LightningDataModule, ABC):
     """Views of one scene; subclasses say where they come from.
 
     Args:
-        pixels_per_step: pixels R that a training step sees.
-        rays_per_pixel_side: rays of a pixel along each of its sides; a pixel's colour is the mean of its rays.
+        rays_per_step: rays of a training step, of all of its pixels.
+        rays_per_pixel_side: rays of a pixel along each of its sides; a pixel's colour is the mean of its rays. Or
+            pairs [step, side], each side from that step of an epoch on; what is not trained on gets the last one.
         background: white, black or random, behind what images leave transparent.
         views_per_step: images that the pixels of a step come from; null takes all.
         precrop: share of the sides of an image, about its middle, that the first steps see.
         precrop_steps: how many steps those are.
         jitter: move rays at random within their part of the pixel in training.
+        focus: share of the pixels of a step that show matter, or lie by it; the others come from anywhere. Means
+            nothing where images have no alpha, or with `views_per_step`.
         seed: of the choice of pixels.
         steps: of an epoch.
     """
 
     def __init__(
         self,
-        pixels_per_step: int = 4096,
-        rays_per_pixel_side: int = 1,
+        rays_per_step: int = 4096,
+        rays_per_pixel_side: int | Sequence[Sequence[int]] = 1,
         background: str = "white",
         views_per_step: int | None = None,
         precrop: float = 1.0,
         precrop_steps: int = 0,
         jitter: bool = False,
+        focus: float = 0.0,
         seed: int = 0,
         steps: int = 100_000,
     ) -> None:
@@ -257,15 +281,16 @@ class SceneViews(LightningDataModule, ABC):
         if background not in BACKGROUNDS:
             raise UserError(f"data.background must be one of {', '.join(BACKGROUNDS)}, got {background!r}")
         _at_least_one(
-            pixels_per_step=pixels_per_step,
-            rays_per_pixel_side=rays_per_pixel_side,
+            rays_per_step=rays_per_step,
             views_per_step=views_per_step,
             steps=steps,
         )
         if not 0 < precrop <= 1:
             raise UserError(f"data.precrop is a share of an image's sides, in (0, 1], got {precrop}")
-        self.pixels_per_step = pixels_per_step
-        self.rays_per_pixel_side = rays_per_pixel_side
+        if not 0 <= focus <= 1:
+            raise UserError(f"data.focus is a share of the pixels, in [0, 1], got {focus}")
+        self.rays_per_step = rays_per_step
+        self.sides = _schedule(rays_per_pixel_side)
         self.background = background
         self.seed = seed
         self.steps = steps
@@ -274,6 +299,7 @@ class SceneViews(LightningDataModule, ABC):
             "precrop": precrop,
             "precrop_steps": precrop_steps,
             "jitter": jitter,
+            "focus": focus,
         }
 
     @abstractmethod
@@ -286,19 +312,25 @@ class SceneViews(LightningDataModule, ABC):
             self.scene = self.load()
 
     @property
-    def caster(self) -> RayCaster:
-        """Makes the rays of this scene."""
-        scene = self.scene
-        return RayCaster(scene.box, scene.depth_range, self.background, self.rays_per_pixel_side, scene.warp)
+    def final_side(self) -> int:
+        """Rays of a pixel along each of its sides, in the end."""
+        return self.sides[-1][1]
 
     @property
-    def test_labels(self) -> tuple[str, ...]:
-        """What each test image is called."""
-        return self.scene.test.labels
+    def caster(self) -> RayCaster:
+        """Makes the rays of whole views."""
+        return self._caster(self.final_side)
+
+    def _caster(self, side: int) -> RayCaster:
+        return RayCaster(self.scene.box, self.scene.depth_range, self.background, side, self.scene.warp)
 
     def train_dataloader(self) -> RandomPixels:
         """Random pixels of the training images."""
-        return RandomPixels(self.caster, self.scene.train, self.pixels_per_step, self.steps, self.seed, **self.how)
+
+        def casters(step: int) -> RayCaster:
+            return self._caster([side for begin, side in self.sides if begin <= step][-1])
+
+        return RandomPixels(casters, self.scene.train, self.rays_per_step, self.steps, self.seed, **self.how)
 
     def val_dataloader(self) -> WholeViews | Sequence[RayBatch]:
         """The validation images, one a batch."""
@@ -307,6 +339,18 @@ class SceneViews(LightningDataModule, ABC):
     def test_dataloader(self) -> WholeViews:
         """The test images, one a batch."""
         return WholeViews(self.caster, self.scene.test)
+
+
+def _schedule(sides: int | Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    """Pairs (step, side), the first at step 0."""
+    pairs = [(0, sides)] if isinstance(sides, int) else [(int(step), int(side)) for step, side in sides]
+    steps = [step for step, _ in pairs]
+    if not pairs or steps[0] != 0 or sorted(steps) != steps or min(side for _, side in pairs) < 1:
+        raise UserError(
+            "data.rays_per_pixel_side is a whole number of at least 1, or pairs [step, side] of rising steps, the "
+            f"first 0, got {sides!r}"
+        )
+    return pairs
 
 
 def _at_least_one(**numbers: int | None) -> None:

@@ -57,7 +57,7 @@ def test_there_may_be_no_held_out_views() -> None:
 
 
 def test_rays_come_out_as_batches() -> None:
-    made = scene(pixels_per_step=50, background="white")
+    made = scene(rays_per_step=50, background="white")
     made.setup("fit")
     batch = next(iter(made.train_dataloader()))
     assert batch.rgb.shape == (50, 3)
@@ -120,7 +120,7 @@ def test_everything_that_makes_the_pixels_is_in_the_key(tmp_path: Path) -> None:
     for variant in variants:
         scene(tmp_path, **variant)._cached_or_taken()
     assert len(cached(tmp_path)) == len(variants)
-    scene(tmp_path, pixels_per_step=7, background="black", seed=5)._cached_or_taken()  # does not
+    scene(tmp_path, rays_per_step=7, background="black", seed=5)._cached_or_taken()  # does not
     assert len(cached(tmp_path)) == len(variants)
 
 

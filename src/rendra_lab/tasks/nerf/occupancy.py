@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rendra.kernels.composite import compact, composite_alphas, visible
-from rendra.kernels.occupancy import dilate, traverse
+from rendra.kernels.occupancy import cells_of, dilate, traverse
 from rendra_lab.data.ray_views import Scene
 from rendra_lab.data.scene_box import carve
 from rendra_lab.networks.radiance import Rays, RaysSeen
@@ -25,24 +25,29 @@ _POINTS_AT_ONCE = 2**18
 class OccupancyRenderer(RayRenderer):
     """Samples of equal length in the cells that are not empty, as far as light reaches.
 
-    A first look without gradients finds the samples that light reaches; these alone are asked for colour. Cells start
-    as the visual hull of the silhouettes, where images have them, and are looked at again in the course of training.
+    Cells start as the visual hull of the silhouettes, where images have them, and are looked at again in the course
+    of training: those that have become empty are skipped, and the mean opacity of the others tells how far light
+    comes. What may be lit after that is asked of the field.
 
     Args:
         field: see `RayRenderer`.
         cells: along the longest side of the scene's box.
         steps_across: samples along that side.
         refresh_every: steps between two looks at the cells.
+        empty_from: the first step at which cells may be empty: before, everything is thin.
         empty_below: a cell is empty where the opacity of a sample in it, the largest of late, is less.
-        decay: of that largest opacity from look to look.
+        decay: of what is remembered of a cell, from look to look.
         stop_below: samples before which less light than this is left are hidden.
+        looks_first: ask the field for opacities without gradients, to find what is hidden, before it is asked with
+            them: worth its time where the field is costly and light ends soon.
         jitter: shift the samples of a ray at random in training.
         rays_at_once: see `RayRenderer`.
     """
 
     occupied: Tensor  # (D, H, W) bool
     hull: Tensor  # (D, H, W) bool: outside it there is nothing, ever
-    opacities: Tensor  # (D, H, W) the largest of late
+    largest: Tensor  # (D, H, W) opacity of a sample in a cell, the largest of late
+    usual: Tensor  # (D, H, W) its mean of late
     is_placed: Tensor
 
     def __init__(
@@ -51,9 +56,11 @@ class OccupancyRenderer(RayRenderer):
         cells: int = 64,
         steps_across: int = 256,
         refresh_every: int = 16,
+        empty_from: int = 100,
         empty_below: float = 0.01,
         decay: float = 0.8,
         stop_below: float = 1e-3,
+        looks_first: bool = False,
         jitter: bool = True,
         rays_at_once: int = 16384,
     ) -> None:
@@ -63,13 +70,16 @@ class OccupancyRenderer(RayRenderer):
         self.cells = cells
         self.steps_across = steps_across
         self.refresh_every = refresh_every
+        self.empty_from = empty_from
         self.empty_below = empty_below
         self.decay = decay
         self.stop_below = stop_below
+        self.looks_first = looks_first
         self.jitter = jitter
         for name in ("occupied", "hull"):
             self.register_buffer(name, torch.ones(1, 1, 1, dtype=torch.bool))
-        self.register_buffer("opacities", torch.ones(1, 1, 1))
+        for name in ("largest", "usual"):
+            self.register_buffer(name, torch.zeros(1, 1, 1))
         self.register_buffer("is_placed", torch.tensor(False))
 
     def place(self, scene: Scene) -> None:
@@ -81,7 +91,8 @@ class OccupancyRenderer(RayRenderer):
         x, y, z = (max(1, round(self.cells * float(side / sides.amax()))) for side in sides)
         self.hull = carve(scene.train, scene.box.cpu(), (z, y, x)).to(self.hull.device)
         self.occupied = self.hull.clone()
-        self.opacities = self.hull.to(self.opacities.dtype)
+        self.largest = torch.zeros(self.hull.shape, device=self.hull.device)
+        self.usual = torch.zeros_like(self.largest)
         self.is_placed.fill_(True)
 
     @torch.no_grad()
@@ -96,8 +107,11 @@ class OccupancyRenderer(RayRenderer):
         length = points.new_full((len(points),), self.step_length)
         pieces = zip(points.split(_POINTS_AT_ONCE), length.split(_POINTS_AT_ONCE), strict=True)
         found = torch.cat([self.field.opacity(*piece) for piece in pieces])
-        self.opacities[self.hull] = torch.maximum(found, self.decay * self.opacities[self.hull])
-        self.occupied = dilate(self.opacities > self.empty_below) & self.hull
+        largest, usual = self.largest[self.hull], self.usual[self.hull]
+        self.largest[self.hull] = torch.maximum(found, self.decay * largest)
+        self.usual[self.hull] = torch.lerp(found, usual, self.decay) if step > self.refresh_every else found
+        if step >= self.empty_from:
+            self.occupied = dilate(self.largest > self.empty_below) & self.hull
 
     @property
     def step_length(self) -> float:
@@ -115,17 +129,28 @@ class OccupancyRenderer(RayRenderer):
         )  # fmt: skip
         points, middles, lengths = self._points(rays, samples.starts, samples.ends, samples.ray_index)
         with torch.no_grad():
-            seen = visible(self.field.opacity(points, lengths), samples.ray_first, self.stop_below)
-        kept, ray_first = compact(seen, samples.ray_first)
+            lit = visible(self._usual_at(points), samples.ray_first, self.stop_below)
+        kept, ray_first = compact(lit, samples.ray_first)
+        if self.looks_first:
+            with torch.no_grad():
+                opacities = self.field.opacity(points.index_select(0, kept), lengths.index_select(0, kept))
+            seen, ray_first = compact(visible(opacities, ray_first, self.stop_below), ray_first)
+            kept = kept.index_select(0, seen)
         ray_index = samples.ray_index.index_select(0, kept)
         points, middles, lengths = (values.index_select(0, kept) for values in (points, middles, lengths))
         alphas, rgb = self.field(points, rays.directions, lengths, ray_index)
         light = composite_alphas(alphas, rgb, middles, ray_first)
         return RaysSeen(light.features, light.opacity, light.depth)
 
+    def _usual_at(self, points: Tensor) -> Tensor:
+        """The usual opacity of samples at points (M, 3): (M,)."""
+        depth, height, width = self.usual.shape
+        cell = cells_of(points, self.field.box, (depth, height, width))
+        return self.usual.flatten().index_select(0, cell.clamp_min(0))
+
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""
-        for name in ("occupied", "hull", "opacities"):
+        for name in ("occupied", "hull", "largest", "usual"):
             if prefix + name in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.hull.device))
         super()._load_from_state_dict(state_dict, prefix, *args)

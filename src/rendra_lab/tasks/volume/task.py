@@ -20,11 +20,11 @@ from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_ray
 from rendra_lab.tasks.volume.grid import VolumeGrid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VolumePrediction(RadiancePrediction):
     """What the rays of pixels saw, and how rough the volume is."""
 
-    roughness: Float[Tensor, ""] | None = None  # mean squared difference of neighbouring voxels; in training only
+    roughness: Float[Tensor, ""]  # mean squared difference of neighbouring voxels, where it is measured; else 0
 
 
 class Volume(Task[RayBatch, VolumePrediction]):
@@ -35,6 +35,7 @@ class Volume(Task[RayBatch, VolumePrediction]):
         refine_at: the steps at which its second, third, ... level begins.
         look_every: steps after which cells that have become empty are found.
         look_from: the first step at which they are: before, everything is thin.
+        smooth_every: steps after which the volume's roughness is measured; it counts so many times as much then.
         **parts: losses, metrics, optimizer, scheduler of `Task`.
     """
 
@@ -44,6 +45,7 @@ class Volume(Task[RayBatch, VolumePrediction]):
         refine_at: Sequence[int] | int = (),
         look_every: int = 50,
         look_from: int = 100,
+        smooth_every: int = 4,
         **parts: Any,
     ) -> None:
         super().__init__(**parts)
@@ -51,17 +53,25 @@ class Volume(Task[RayBatch, VolumePrediction]):
         if len(refine_at) != len(volume.voxels) - 1 or sorted(refine_at) != refine_at:
             levels = len(volume.voxels)
             raise ValueError(f"module.refine_at: {levels} levels begin at {levels - 1} rising steps, got {refine_at}")
-        if look_every < 1:
-            raise ValueError(f"module.look_every must be at least 1, got {look_every}")
+        if min(look_every, smooth_every) < 1:
+            raise ValueError(
+                f"module.look_every and module.smooth_every must be at least 1, got {look_every} and {smooth_every}"
+            )
         self.volume = volume
         self.refine_at = refine_at
         self.look_every = look_every
         self.look_from = look_from
+        self.smooth_every = smooth_every
 
     def predict(self, batch: RayBatch) -> VolumePrediction:
         """What the rays of a batch see."""
         seen = mean_over_rays(self.volume(Rays.of(batch)), batch)
-        return VolumePrediction(**vars(seen), roughness=self.volume.roughness() if self.training else None)
+        return VolumePrediction(**vars(seen), roughness=self._roughness())
+
+    def _roughness(self) -> Tensor:
+        if self.training and self.global_step % self.smooth_every == 0:
+            return self.smooth_every * self.volume.roughness()
+        return self.volume.box.new_zeros(())
 
     def on_fit_start(self) -> None:
         """Lightning's hook: lays the voxels into the scene, unless a checkpoint did."""
