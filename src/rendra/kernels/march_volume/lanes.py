@@ -13,6 +13,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+BLOCK = 64  # samples that are looked at together
+
 
 def _vector(count):
     return ir.VectorType(ir.FloatType(), count)
@@ -60,14 +62,14 @@ def _place(builder, data, at, count):
 
 
 def _row_offsets(builder, at, row, plane):
-    """The four rows of a cell with their places along y and z."""
+    """The four rows of a cell, x along each: y and then z are far in the later ones."""
     upper = builder.add(at, plane)
-    return ((at, 0, 0), (builder.add(at, row), 1, 0), (upper, 0, 1), (builder.add(upper, row), 1, 1))
+    return at, builder.add(at, row), upper, builder.add(upper, row)
 
 
-def _both(builder, fraction):
-    """How far the near and the far end of an axis count."""
-    return builder.fsub(ir.Constant(ir.FloatType(), 1.0), fraction), fraction
+def _numbers(builder, weights, near):
+    """The five numbers of a sample in a block."""
+    return [builder.load(builder.gep(weights, [builder.add(near, ir.IntType(64)(BLOCK * i))])) for i in range(5)]
 
 
 @intrinsic
@@ -81,44 +83,51 @@ def pointer(typingctx, array):
 
 
 @intrinsic
-def gather(typingctx, flat, at, row, plane, fx, fy, fz, lanes):
-    """The lanes at fractions f of a cell whose first voxel begins at flat[at]; rows and planes lie apart as said."""
+def gather(typingctx, flat, at, row, plane, weights, near, lanes):
+    """The lanes between the voxels of a cell, whose first begins at flat[at]; rows and planes lie apart as said.
+
+    What counts is at weights[near + BLOCK i]: i = 0 is the fraction along x, 1 to 4 are the weights of the rows.
+    """
 
     def codegen(context, builder, signature, arguments):
-        data, at, row, plane, fx, fy, fz, _ = arguments
+        data, at, row, plane, weights, near, _ = arguments
         count = len(lanes)
-        along_y, along_z = _both(builder, fy), _both(builder, fz)
+        fraction, *shares = _numbers(builder, weights, near)
         total = ir.Constant(_vector(2 * count), [0.0] * (2 * count))
-        for offset, y, z in _row_offsets(builder, at, row, plane):
+        for offset, share in zip(_row_offsets(builder, at, row, plane), shares, strict=True):
             pair = builder.load(_place(builder, data, offset, 2 * count), align=4)
-            weight = _splat(builder, builder.fmul(along_y[y], along_z[z]), 2 * count)
-            total = _multiply_add(builder, pair, weight, total)
+            total = _multiply_add(builder, pair, _splat(builder, share, 2 * count), total)
         near, far = (_slice(builder, total, first, count) for first in (0, count))
-        blended = _multiply_add(builder, builder.fsub(far, near), _splat(builder, fx, count), near)
+        blended = _multiply_add(builder, builder.fsub(far, near), _splat(builder, fraction, count), near)
         return _lanes_of(context, builder, lanes, blended)
 
-    return lanes(flat, types.intp, types.intp, types.intp, *[types.float32] * 3, lanes), codegen
+    return lanes(flat, types.intp, types.intp, types.intp, weights, types.intp, lanes), codegen
 
 
 @intrinsic
-def scatter(typingctx, flat, at, row, plane, fx, fy, fz, lanes):
-    """Add lanes to the voxels of a cell, each its share: the transpose of `gather`."""
+def scatter(typingctx, flat, at, row, plane, weights, near, lanes):
+    """Add lanes to the voxels of a cell, each its share: the transpose of `gather`.
+
+    Voxel by voxel: the next sample's cell often begins one voxel further, and what is loaded from half of a longer
+    store has to wait until that is in the cache.
+    """
 
     def codegen(context, builder, signature, arguments):
-        data, at, row, plane, fx, fy, fz, values = arguments
+        data, at, row, plane, weights, near, values = arguments
         count = len(lanes)
-        along_x, along_y, along_z = (_both(builder, fraction) for fraction in (fx, fy, fz))
-        scalars = [builder.extract_value(values, i) for i in range(count)]
-        spread = _packed(builder, scalars * 2)
-        shares = _packed(builder, [along_x[0]] * count + [along_x[1]] * count)
-        spread = builder.fmul(spread, shares)
-        for offset, y, z in _row_offsets(builder, at, row, plane):
-            place = _place(builder, data, offset, 2 * count)
-            weight = _splat(builder, builder.fmul(along_y[y], along_z[z]), 2 * count)
-            builder.store(_multiply_add(builder, spread, weight, builder.load(place, align=4)), place, align=4)
+        fraction, *shares = _numbers(builder, weights, near)
+        whole = _vector_of(builder, lanes, values)
+        far = builder.fmul(whole, _splat(builder, fraction, count))
+        ends = builder.fsub(whole, far), far
+        for offset, share in zip(_row_offsets(builder, at, row, plane), shares, strict=True):
+            weight = _splat(builder, share, count)
+            for i, end in enumerate(ends):
+                place = _place(builder, data, builder.add(offset, ir.IntType(64)(i * count)), count)
+                old = builder.load(place, align=4)
+                builder.store(_multiply_add(builder, end, weight, old), place, align=4)
         return context.get_dummy_value()
 
-    return types.void(flat, types.intp, types.intp, types.intp, *[types.float32] * 3, lanes), codegen
+    return types.void(flat, types.intp, types.intp, types.intp, weights, types.intp, lanes), codegen
 
 
 @intrinsic
@@ -184,3 +193,22 @@ def dot(typingctx, lanes, others):
         return total
 
     return types.float32(lanes, lanes), codegen
+
+
+@intrinsic
+def weighted_sum(typingctx, total, flat, weights, values, number):
+    """The lanes total + sum_j w_j v_j: `number` weights begin at flat[weights], as many lanes at flat[values]."""
+
+    def codegen(context, builder, signature, arguments):
+        total, data, weights, values, number = arguments
+        kind = signature.args[0]
+        width = ir.IntType(64)(len(kind))
+        running = cgutils.alloca_once_value(builder, _vector_of(builder, kind, total))
+        with cgutils.for_range(builder, number) as loop:
+            weight = builder.load(builder.gep(data, [builder.add(weights, loop.index)]))
+            place = _place(builder, data, builder.add(values, builder.mul(loop.index, width)), len(kind))
+            term = builder.load(place, align=4), _splat(builder, weight, len(kind))
+            builder.store(_multiply_add(builder, *term, builder.load(running)), running)
+        return _lanes_of(context, builder, kind, builder.load(running))
+
+    return total(total, flat, types.intp, types.intp, types.intp), codegen
