@@ -163,10 +163,15 @@ class Task(BaseTask[BatchT, PredictionT]):
         return torch.cat([term.residuals(prediction, batch, step) for _, term in self._weighted()])
 
     def training_step(self, batch: BatchT, batch_idx: int) -> Tensor:
-        """Lightning's hook: the objective of one batch, logged with its terms under `train/`."""
-        total, terms = self.objective(self.predict(batch), batch)
+        """Lightning's hook: the objective of one batch, logged with its terms and watched metrics under `train/`."""
+        prediction = self.predict(batch)
+        total, terms = self.objective(prediction, batch)
         values = {f"train/loss_{name}": value.detach() for name, value in terms.items()}
-        self.log_dict({"train/loss": total.detach(), **values}, prog_bar=True, batch_size=1)
+        metrics = cast(Iterator[tuple[str, MetricTerm]], self.metrics.items())
+        watched = {
+            f"train/{name}": _named(name, term, prediction, batch) for name, term in metrics if term.in_training
+        }
+        self.log_dict({"train/loss": total.detach(), **values, **watched}, prog_bar=True, batch_size=1)
         return total
 
     def on_train_batch_start(self, batch: BatchT, batch_idx: int) -> None:

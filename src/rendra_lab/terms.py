@@ -121,6 +121,7 @@ class MetricTerm(_Term):
         prediction: the field of the prediction.
         target: the field of the batch, or null.
         context: further keyword arguments of `fn`, each with the batch field that it takes.
+        in_training: also measured at every training step, and shown beside the losses. Only of functions.
     """
 
     def __init__(
@@ -129,8 +130,12 @@ class MetricTerm(_Term):
         prediction: str = "rgb",
         target: str | None = "rgb",
         context: Mapping[str, str] | None = None,
+        in_training: bool = False,
     ) -> None:
         super().__init__(fn, prediction, target, context)
+        if in_training and isinstance(fn, Metric):
+            raise TypeError(f"{type(fn).__name__} averages over an epoch: it cannot be shown at every training step")
+        self.in_training = in_training
 
     @torch.no_grad()
     def forward(self, prediction: Any, batch: Any) -> Tensor | Metric:

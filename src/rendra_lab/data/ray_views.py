@@ -34,6 +34,7 @@ class RayBatch(TensorRecord):
 
     rgb: Float[Tensor, "*pixels 3"]  # sRGB in [0, 1], laid over the background
     mask: Float[Tensor, "*pixels"]  # coverage in [0, 1]; 1 in images without alpha
+    cut_out: Float[Tensor, "*pixels"]  # 1 in images with alpha, whose mask means something; else 0
     background: Float[Tensor, "*pixels 3"]  # what is behind everything, sRGB in [0, 1]
     origins: Float[Tensor, "*pixels K 3"]  # in the world
     directions: Float[Tensor, "*pixels K 3"]  # of length 1
@@ -106,7 +107,7 @@ class RayCaster:
         origins, directions = self._rays(images, view, place, generator if jitter else None)
         rgba = images.pixels.index_select(0, chosen).float() / 255
         behind = self._behind(len(chosen), generator)
-        return self._batch(rgba, behind, origins, directions)
+        return self._batch(rgba, images.has_alpha, behind, origins, directions)
 
     def view(self, images: PosedImages, index: int) -> RayBatch:
         """All pixels of one image: (1, H, W)."""
@@ -117,7 +118,7 @@ class RayCaster:
         """All pixels of a camera that took no image, (1, H, W): nothing but background before its rays."""
         place = torch.arange(int(cameras.sizes[index].prod()))
         origins, directions = self._rays(cameras, torch.full_like(place, index), place, None)
-        flat = self._batch(torch.zeros(len(place), 4), self._behind(len(place), None), origins, directions)
+        flat = self._batch(torch.zeros(len(place), 4), True, self._behind(len(place), None), origins, directions)
         return _as_view(flat, cameras, index)
 
     def _rays(
@@ -144,14 +145,16 @@ class RayCaster:
             return torch.full((count, 3), value)
         return torch.ones(count, 3) if generator is None else torch.rand(count, 3, generator=generator)
 
-    def _batch(self, rgba: Tensor, behind: Tensor, origins: Tensor, directions: Tensor) -> RayBatch:
+    def _batch(self, rgba: Tensor, has_alpha: bool, behind: Tensor, origins: Tensor, directions: Tensor) -> RayBatch:
         origins, directions = (rays.reshape(len(rgba), -1, 3) for rays in (origins, directions))
         nearest, farthest = within_box(origins, directions, self.box)
         if self.depth_range is not None:
             nearest, farthest = nearest.clamp_min(self.depth_range[0]), farthest.clamp_max(self.depth_range[1])
         alpha = rgba[:, 3:]
         rgb = rgba[:, :3] * alpha + behind * (1 - alpha)
-        return RayBatch(rgb, alpha[:, 0], behind, origins, directions, nearest, torch.maximum(nearest, farthest))
+        farthest = torch.maximum(nearest, farthest)
+        cut_out = torch.full_like(alpha[:, 0], float(has_alpha))
+        return RayBatch(rgb, alpha[:, 0], cut_out, behind, origins, directions, nearest, farthest)
 
 
 def _as_view(flat: RayBatch, images: PosedImages, index: int) -> RayBatch:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 class RadianceField(nn.Module, ABC):
     """Density or opacity, and light, at points of a box. Subclasses say which of the two their matter is."""
 
+    is_density: bool = True  # longer samples stop more light; False: a sample's opacity is the same at any length
     box: Tensor  # (2, 3) lowest and highest corner of what may hold anything, in the world
 
     def __init__(self) -> None:

@@ -99,6 +99,7 @@ class MLPBook(MLPField):
         chunk: see `MLPField`.
     """
 
+    is_density = False
     frequencies: Tensor
 
     def __init__(self, width: int = 256, frequencies: int = 60, chunk: int = 1 << 15) -> None:

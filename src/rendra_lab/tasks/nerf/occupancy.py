@@ -15,6 +15,7 @@ from rendra.kernels.composite import compact, composite_alphas, visible
 from rendra.kernels.occupancy import cells_of, dilate, traverse
 from rendra_lab.data.ray_views import Scene
 from rendra_lab.data.scene_box import carve
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
@@ -67,6 +68,11 @@ class OccupancyRenderer(RayRenderer):
         super().__init__(field, rays_at_once)
         if min(cells, steps_across, refresh_every) < 1:
             raise ValueError("sampler.cells, sampler.steps_across and sampler.refresh_every must be at least 1")
+        if not field.is_density:
+            raise UserError(
+                f"sampler=occupancy needs a field of densities, and a sample of {type(field).__name__} is as opaque "
+                "at any length: take sampler=stratified"
+            )
         self.cells = cells
         self.steps_across = steps_across
         self.refresh_every = refresh_every
