@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +34,7 @@ class _TruncatedExp(torch.autograd.Function):
         return gradients[0] * y
 
 
+@runtime_checkable
 class Encoding(Protocol):
     """Turns points or directions (M, 3) into features (M, width)."""
 
