@@ -148,11 +148,18 @@ class OccupancyRenderer(RayRenderer):
         light = composite_alphas(alphas, rgb, middles, ray_first)
         return RaysSeen(light.features, light.opacity, light.depth)
 
+    def looks_at(self, points: Tensor) -> Tensor:
+        """Whether points (M, 3) lie in cells that are not empty: (M,) bool."""
+        cell = self._cells_of(points)
+        return self.occupied.flatten().index_select(0, cell.clamp_min(0)) & (cell >= 0)
+
     def _usual_at(self, points: Tensor) -> Tensor:
         """The usual opacity of samples at points (M, 3): (M,)."""
-        depth, height, width = self.usual.shape
-        cell = cells_of(points, self.field.box, (depth, height, width))
-        return self.usual.flatten().index_select(0, cell.clamp_min(0))
+        return self.usual.flatten().index_select(0, self._cells_of(points).clamp_min(0))
+
+    def _cells_of(self, points: Tensor) -> Tensor:
+        depth, height, width = self.occupied.shape
+        return cells_of(points, self.field.box, (depth, height, width))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""

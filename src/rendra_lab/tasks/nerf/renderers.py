@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rendra_lab.data.ray_views import Scene
 from rendra_lab.networks.radiance import Rays, RaysSeen
@@ -50,3 +50,7 @@ class RayRenderer(nn.Module, ABC):
 
     def refresh(self, step: int) -> None:
         """Called before every training step: a renderer that remembers empty space looks again now and then."""
+
+    def looks_at(self, points: Tensor) -> Tensor:
+        """Whether rays are ever sampled about points (M, 3): (M,) bool. Elsewhere the field means nothing."""
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)

@@ -55,7 +55,8 @@ class NeRF(Task[RayBatch, RadiancePrediction]):
 
     def opacity_at(self, points: Tensor, step: float) -> Tensor:
         """See `RadianceScene`."""
-        return self.renderer.field.opacity(points, points.new_full((len(points),), step))
+        found = self.renderer.field.opacity(points, points.new_full((len(points),), step))
+        return found * self.renderer.looks_at(points)
 
     def color_at(self, points: Tensor, directions: Tensor) -> Tensor:
         """See `RadianceScene`."""

@@ -176,11 +176,12 @@ class VolumeGrid(nn.Module):
         return _SlabVariation.apply(self.grid, first, thick)
 
     def read(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Density per unit (M,) and colour (M, 3) at points (M, 3) of the world; nothing outside the box."""
+        """Density per unit (M,) and colour (M, 3) at points (M, 3) of the world; nothing where rays find nothing."""
         places = 2 * (points - self.box[0]) / (self.box[1] - self.box[0]) - 1
         raw = F.grid_sample(self.grid.movedim(-1, 1), places[None, None, None], align_corners=True)[0, :, 0, 0]
-        inside = (places.abs() <= 1).all(-1)
-        return F.softplus(raw[0]) * inside, raw[1:].T.sigmoid()
+        cells = self.occupied[None, None].to(raw.dtype)
+        held = F.grid_sample(cells, places[None, None, None], mode="nearest", align_corners=False)[0, 0, 0, 0]
+        return F.softplus(raw[0]) * held, raw[1:].T.sigmoid()
 
     def opacity(self, points: Tensor, step: float) -> Tensor:
         """Opacity (M,) of matter of thickness `step`."""
