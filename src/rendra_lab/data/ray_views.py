@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
@@ -202,7 +203,8 @@ class RandomPixels:
         self._next = state["next"] % self.steps
 
     def _batch(self, step: int) -> RayBatch:
-        generator = torch.Generator().manual_seed((self.seed << 32) + step)
+        mixed = np.random.SeedSequence([self.seed, step]).generate_state(1)  # torch takes 32 bits of a seed alone
+        generator = torch.Generator().manual_seed(int(mixed[0]))
         caster = self.casters(step)
         chosen = self._chosen(step, max(1, self.num_rays // caster.side**2), generator)
         return caster.pixels(self.images, chosen, generator, self.jitter)
