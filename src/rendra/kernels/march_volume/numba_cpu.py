@@ -35,7 +35,8 @@ _AT = 2 * BLOCK  # where the voxels are in the whole numbers of a bench, behind 
 _RAW, _ALPHA, _SLOPE, _WEIGHT, _VALUES = (i * BLOCK for i in range(5, 10))  # in the others; weights are first
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
 _SLABS = 8  # of planes along z: what threads own in the backward pass
-_BYTES_AT_ONCE = 2**25  # of gradients of samples, on their way from rays to slabs
+_NOTED = 2 * _SLABS + 2
+_BYTES_AT_ONCE = 2**22  # of gradients of samples, on their way from rays to slabs
 
 
 class Settings(NamedTuple):
@@ -61,7 +62,7 @@ class _Chunk(NamedTuple):
 
     asked: np.ndarray  # (rays, S, K) gradients of samples
     steps: np.ndarray  # (rays S + a block) which samples
-    pieces: np.ndarray  # (rays, slabs, 2) which of them are in a slab: begin, end
+    pieces: np.ndarray  # (rays, 2 slabs + 2) which of them are in a slab, and which samples not at a border: begin, end
     trails: np.ndarray  # (workers, 4, S) what a ray needs on its way back
 
 
@@ -94,7 +95,7 @@ def backward(
     chunk = _Chunk(
         np.empty((rays_at_once, samples, channels), np.float32),
         np.zeros(rays_at_once * samples + BLOCK, np.int32),
-        np.empty((rays_at_once, _SLABS, 2), np.int32),
+        np.empty((rays_at_once, _NOTED), np.int32),
         np.empty((workers, 4, samples), np.float32),
     )
     grad = np.zeros(grid.shape, np.float32)
@@ -192,8 +193,9 @@ def _look_back(inputs, m, settings, lanes, bench, upstreams, notes, r):
     upstream, of_scalars = upstreams
     asked, steps, pieces, trail = notes
     count, samples = len(lanes), settings.samples
-    for i in range(2 * _SLABS):
-        pieces[2 * _SLABS * r + i] = np.int32(0)
+    piece = _NOTED * r
+    for i in range(_NOTED):
+        pieces[piece + i] = np.int32(0)
     if not _is_finite(rays, m):
         return
     ray = _ray(rays, m)
@@ -205,6 +207,7 @@ def _look_back(inputs, m, settings, lanes, bench, upstreams, notes, r):
     cells = _in_cells(ray, settings)
     k, end = _span(ray, settings)
     between = _between(ray, k, end, settings)
+    pieces[piece + 2 * _SLABS], pieces[piece + 2 * _SLABS + 1] = np.int32(between[0]), np.int32(between[1])
     while k < end and not abs(left) < settings.stop_below:
         found, k = _next_samples(places, ray, k, end, cells, inputs[2], settings)
         _read(inputs, m, ray, found, between, settings, lanes, bench)
@@ -224,18 +227,18 @@ def _look_back(inputs, m, settings, lanes, bench, upstreams, notes, r):
             z = ray[2] + np.float32(places[j]) * ray[5]
             if slab < 0 or z < low or z >= high:
                 if slab >= 0:
-                    pieces[2 * (_SLABS * r + slab) + 1] = np.int32(entry)
+                    pieces[piece + 2 * slab + 1] = np.int32(entry)
                 slab = min(max(_floor(z), 0), settings.depth - 1) // planes
                 low = np.float32(slab * planes) if slab > 0 else -_FAR
                 high = np.float32((slab + 1) * planes) if (slab + 1) * planes < settings.depth else _FAR
-                pieces[2 * (_SLABS * r + slab)] = np.int32(entry)
+                pieces[piece + 2 * slab] = np.int32(entry)
             steps[place + entry] = places[j]
             entry += 1
             left *= ONE - alpha
             if abs(left) < settings.stop_below:
                 break
     if slab >= 0:
-        pieces[2 * (_SLABS * r + slab) + 1] = np.int32(entry)
+        pieces[piece + 2 * slab + 1] = np.int32(entry)
     behind = -of_scalars[2 * m]
     for j in range(entry - 1, -1, -1):
         asked[(place + j) * count] = trail[samples + j] * (trail[2 * samples + j] - behind)
@@ -247,13 +250,14 @@ def _spread(rays, m, settings, lanes, bench, notes, r, slab, grad):
     """Add the piece of a ray that is in a slab to its voxels."""
     asked, steps, pieces, _ = notes
     places, scratch = bench
-    begin, end = pieces[2 * (_SLABS * r + slab)], pieces[2 * (_SLABS * r + slab) + 1]
+    piece = _NOTED * r
+    begin, end = pieces[piece + 2 * slab], pieces[piece + 2 * slab + 1]
     if begin == end:
         return
     count, place = len(lanes), r * settings.samples
     row, plane, first = settings.width * count, settings.height * settings.width * count, _first(m, settings, lanes)
     ray = _ray(rays, m)
-    low, high = _between(ray, steps[place + begin], steps[place + end - 1] + 1, settings)
+    low, high = pieces[piece + 2 * _SLABS], pieces[piece + 2 * _SLABS + 1]
     for entry in range(begin, end, BLOCK):
         for j in range(BLOCK):
             places[j] = steps[place + entry + j]
