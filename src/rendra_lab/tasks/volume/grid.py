@@ -15,11 +15,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra.kernels.march_volume import march_volume
-from rendra_lab.data.ray_views import Scene
+from rendra_lab.data.ray_views import Scene, within_box
 from rendra_lab.data.scene_box import carve
 from rendra_lab.networks.radiance import Rays, RaysSeen
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
+_SHORTEST = 1e-9  # step of a ray without length, as a share of others
 _CELLS_ACROSS = 64  # of the occupancy, along the longest side
 
 
@@ -134,6 +135,8 @@ class VolumeGrid(nn.Module):
         """Find the cells that have become empty; they stay empty."""
         density = F.softplus(self.grid[0, ..., 0])
         alpha = -torch.expm1(-density * self._delta())
+        if any(few < many for few, many in zip(alpha.shape, self.occupied.shape, strict=True)):
+            alpha = F.max_pool3d(alpha[None], 3, stride=1, padding=1)[0]  # a voxel reaches further than a cell
         cells = F.adaptive_max_pool3d(alpha[None], self.occupied.shape)[0]
         near = F.max_pool3d(cells[None], 3, stride=1, padding=1)[0]
         self.occupied &= (near > self.empty_below).to(torch.uint8)
@@ -143,18 +146,19 @@ class VolumeGrid(nn.Module):
         size = (self.box[1] - self.box[0]).amax()
         last = self.grid.new_tensor(self.grid.shape[3:0:-1]) - 1
         scale = last / (self.box[1] - self.box[0])  # voxels a unit of length, xyz
-        step = self._step()
         offset = torch.rand_like(rays.nearest) if jitter else torch.full_like(rays.nearest, 0.5)
         reach = (rays.farthest - rays.nearest).amax() if len(rays.nearest) else size
+        count = int(reach / self._step()) + 1
+        step = self._steps(rays, count)
         seen = march_volume(
             self.grid,
             ((rays.origins - self.box[0]) * scale)[None],
             (rays.directions * scale)[None],
             (rays.nearest + offset * step)[None],
-            step,
-            int(reach / step) + 1,
+            step[None],
+            count,
             mode="density",
-            delta=self._delta(),
+            delta=step[None] / self._unit(),
             activations=("softplus", "sigmoid"),
             occupancy=self.occupied,
             stop_below=self.stop_below,
@@ -193,6 +197,14 @@ class VolumeGrid(nn.Module):
     def _step(self) -> float:
         size = float((self.box[1] - self.box[0]).amax())
         return size / (self.voxels[int(self.level)] - 1) / self.steps_per_voxel
+
+    def _steps(self, rays: Rays, count: int) -> Tensor:
+        """From sample to sample of each ray (Q,): the box ends most rays, and what ends before it is divided."""
+        leaves = within_box(rays.origins, rays.directions, self.box)[1]
+        length = rays.farthest - rays.nearest
+        ends_before = rays.nearest + length < leaves * (1 - 1e-5)
+        step = torch.full_like(length, self._step())
+        return torch.where(ends_before, (length / count).clamp_min(_SHORTEST * self._step()), step)
 
     def _delta(self) -> float:
         return self._step() / self._unit()
