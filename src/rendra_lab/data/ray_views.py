@@ -147,7 +147,7 @@ class RayCaster:
         return torch.ones(count, 3) if generator is None else torch.rand(count, 3, generator=generator)
 
     def _batch(self, rgba: Tensor, has_alpha: bool, behind: Tensor, origins: Tensor, directions: Tensor) -> RayBatch:
-        origins, directions = (rays.reshape(len(rgba), -1, 3) for rays in (origins, directions))
+        origins, directions = (rays.reshape(len(rgba), self.side**2, 3) for rays in (origins, directions))
         nearest, farthest = within_box(origins, directions, self.box)
         if self.depth_range is not None:
             nearest, farthest = nearest.clamp_min(self.depth_range[0]), farthest.clamp_max(self.depth_range[1])
