@@ -80,6 +80,19 @@ def test_looking_changes_neither_modes_nor_random_numbers_nor_gradients() -> Non
     assert not toy.show_meshes(batch())["triangle"].textures.verts_features_packed().requires_grad
 
 
+def test_watched_metrics_are_logged_in_training() -> None:
+    watched = {"psnr": MetricTerm(metrics.psnr, in_training=True), "mae": MetricTerm(metrics.mean_absolute_error)}
+    run, toy = trainer(steps=1), task(metrics=watched)
+    data = ToyData(steps=1)
+    data.setup("fit")
+    expected = toy.score(toy.predict(data.batch), data.batch)["psnr"]
+    run.fit(toy, datamodule=data)
+    assert {"train/loss", "train/psnr"} <= set(run.callback_metrics)
+    assert "train/mae" not in run.callback_metrics
+    assert_close(run.callback_metrics["train/psnr"], expected)
+    assert {"val/psnr", "val/mae"} <= set(run.callback_metrics)
+
+
 class Recorder(torch.optim.SGD):
     """Notes what it is handed."""
 

@@ -49,6 +49,13 @@ def test_metrics_are_functions_or_torchmetrics() -> None:
     assert float(mean.fn.compute()) == 3.0
 
 
+def test_only_functions_are_measured_in_training() -> None:
+    assert not MetricTerm(metrics.psnr).in_training
+    assert MetricTerm(metrics.psnr, in_training=True).in_training
+    with pytest.raises(TypeError, match="MeanMetric averages over an epoch"):
+        MetricTerm(MeanMetric(), in_training=True)
+
+
 def test_a_metric_is_never_differentiated() -> None:
     prediction = {"rgb": torch.ones(3, requires_grad=True)}
     assert not MetricTerm(metrics.mean_absolute_error)(prediction, BATCH).requires_grad
