@@ -84,6 +84,7 @@ def march_volume(
     ]
     rays = torch.cat((origins, directions, torch.stack(scalars, dim=-1)), dim=-1)
     is_fast = grid.device.type == "cpu" and grid.dtype == torch.float32 and grid.shape[-1] <= _LANES[-1]
+    is_fast = is_fast and grid[:1, ..., 0].numel() < 2**31  # voxels are counted in 32 bits
     if not is_fast or (rays.requires_grad and torch.is_grad_enabled()):
         return MarchedRays(
             *reference.march_volume(grid, rays, occupancy, num_samples, mode, activations, float(stop_below))

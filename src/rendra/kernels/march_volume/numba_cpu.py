@@ -26,16 +26,15 @@ from rendra.kernels.march_volume.lanes import (
 from rendra.kernels.parallel import inlined_kernel, num_threads, parallel_kernel, scalar_kernel
 
 SIGMOID, SOFTPLUS, EXP = 1, 2, 3  # activations; 0 is none
-_FAR = np.float32(1e30)
-_MANY = np.float32(1 << 20)
+_MANY = 1 << 31  # more than steps and voxels along an axis
 _MOST_OFF = 3  # samples by which a clipped ray is usually too long, at either end
 _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 A3, A5, A7, A9, A11, A13 = (np.float32(1.0 / k) for k in range(3, 14, 2))
-_AT = 2 * BLOCK  # where the voxels are in the whole numbers of a bench, behind the samples
+_AT, _LEVEL = 2 * BLOCK, 3 * BLOCK  # where voxels and planes are in the whole numbers of a bench, behind samples
 _RAW, _ALPHA, _SLOPE, _WEIGHT, _VALUES = (i * BLOCK for i in range(5, 10))  # in the others; weights are first
 _RAYS_AT_ONCE = 64  # that a thread takes in turn
 _SLABS = 8  # of planes along z: what threads own in the backward pass
-_NOTED = 2 * _SLABS + 2
+_NOTED = 2 * _SLABS + 2  # numbers that a ray leaves for slabs
 _BYTES_AT_ONCE = 2**22  # of gradients of samples, on their way from rays to slabs
 
 
@@ -62,7 +61,9 @@ class _Chunk(NamedTuple):
 
     asked: np.ndarray  # (rays, S, K) gradients of samples
     steps: np.ndarray  # (rays S + a block) which samples
-    pieces: np.ndarray  # (rays, 2 slabs + 2) which of them are in a slab, and which samples not at a border: begin, end
+    pieces: (
+        np.ndarray
+    )  # (rays, 2 slabs + 2) which of them are in a slab, and which samples not at a border: begin, end
     trails: np.ndarray  # (workers, 4, S) what a ray needs on its way back
 
 
@@ -109,7 +110,7 @@ def _benches(channels: int) -> tuple[np.ndarray, np.ndarray]:
     """For each thread what a block of samples needs: whole numbers, and others."""
     workers = num_threads()
     return (
-        np.zeros((workers, 3 * BLOCK), np.int32),
+        np.zeros((workers, 4 * BLOCK), np.int32),
         np.zeros((workers, _VALUES + (BLOCK + 8) * channels), np.float32),
     )
 
@@ -202,7 +203,7 @@ def _look_back(inputs, m, settings, lanes, bench, upstreams, notes, r):
     place = r * samples
     wanted = load(upstream, m * count, lanes)
     of_length = of_scalars[2 * m + 1]
-    left, entry, slab, low, high = ONE, 0, -1, ZERO, ZERO
+    left, entry, last, low, high = ONE, 0, -1, 0, 0
     planes = (settings.depth + _SLABS - 1) // _SLABS
     cells = _in_cells(ray, settings)
     k, end = _span(ray, settings)
@@ -214,35 +215,54 @@ def _look_back(inputs, m, settings, lanes, bench, upstreams, notes, r):
         _opacities(scratch, ray[8], settings)
         if settings.feature_activation == SIGMOID:
             _sigmoids(scratch, lanes)
+        kept = found
         for j in range(found):
-            alpha, values = scratch[_ALPHA + j], load(scratch, _VALUES + j * count, lanes)
-            pull = add_scaled(lanes, alpha * left, wanted)
-            if settings.feature_activation == SIGMOID:
-                pull = multiplied(pull, add_scaled(values, -ONE, multiplied(values, values)))
-            store(asked, (place + entry) * count, pull)
-            worth = dot(wanted, values) + of_length * (ray[6] + np.float32(places[j]) * ray[7])
-            trail[entry], trail[samples + entry] = ONE - alpha, left * scratch[_SLOPE + j]
-            trail[2 * samples + entry] = worth
-            trail[3 * samples + entry] = worth * alpha
-            z = ray[2] + np.float32(places[j]) * ray[5]
-            if slab < 0 or z < low or z >= high:
-                if slab >= 0:
-                    pieces[piece + 2 * slab + 1] = np.int32(entry)
-                slab = min(max(_floor(z), 0), settings.depth - 1) // planes
-                low = np.float32(slab * planes) if slab > 0 else -_FAR
-                high = np.float32((slab + 1) * planes) if (slab + 1) * planes < settings.depth else _FAR
-                pieces[piece + 2 * slab] = np.int32(entry)
-            steps[place + entry] = places[j]
-            entry += 1
+            alpha = scratch[_ALPHA + j]
+            scratch[_WEIGHT + j] = alpha * left
+            trail[entry + j], trail[samples + entry + j] = ONE - alpha, left * scratch[_SLOPE + j]
             left *= ONE - alpha
             if abs(left) < settings.stop_below:
+                kept = j + 1
                 break
-    if slab >= 0:
-        pieces[piece + 2 * slab + 1] = np.int32(entry)
+        for j in range(kept):
+            worth = dot(wanted, load(scratch, _VALUES + j * count, lanes))
+            worth += of_length * (ray[6] + np.float32(places[j]) * ray[7])
+            trail[2 * samples + entry + j], trail[3 * samples + entry + j] = worth, worth * scratch[_ALPHA + j]
+        _ask(scratch, kept, wanted, settings, lanes, asked, (place + entry) * count)
+        for j in range(kept):
+            steps[place + entry + j] = places[j]
+            level = places[_LEVEL + j]
+            if not low <= level < high:
+                slab = min(max(level, 0), settings.depth - 1) // planes
+                low = slab * planes if slab > 0 else -_MANY
+                high = (slab + 1) * planes if (slab + 1) * planes < settings.depth else _MANY
+                pieces[piece + 2 * slab] = np.int32(entry + j)
+                if last >= 0:
+                    pieces[piece + 2 * last + 1] = np.int32(entry + j)
+                last = slab
+        entry += kept
+    if last >= 0:
+        pieces[piece + 2 * last + 1] = np.int32(entry)
     behind = -of_scalars[2 * m]
     for j in range(entry - 1, -1, -1):
         asked[(place + j) * count] = trail[samples + j] * (trail[2 * samples + j] - behind)
         behind = trail[3 * samples + j] + trail[j] * behind
+
+
+@inlined_kernel
+def _ask(scratch, number, wanted, settings, lanes, asked, at):
+    """The gradients of samples' raw features: those of the ray times their weights, through the activation."""
+    count = len(lanes)
+    if settings.feature_activation == SIGMOID:
+        for c in range(BLOCK * count):
+            value = scratch[_VALUES + c]
+            scratch[_VALUES + c] = value - value * value
+        for j in range(number):
+            pull = add_scaled(lanes, scratch[_WEIGHT + j], wanted)
+            store(asked, at + j * count, multiplied(pull, load(scratch, _VALUES + j * count, lanes)))
+    else:
+        for j in range(number):
+            store(asked, at + j * count, add_scaled(lanes, scratch[_WEIGHT + j], wanted))
 
 
 @inlined_kernel
@@ -354,6 +374,7 @@ def _place(places, scratch, ray, settings):
         x, y, z = _point(ray, places[j])
         ix, iy, iz = _floor_32(x), _floor_32(y), _floor_32(z)
         places[_AT + j] = np.int32(np.int32(np.int32(np.int32(iz * height) + iy) * width) + ix)
+        places[_LEVEL + j] = iz
         y, z = y - np.float32(iy), z - np.float32(iz)
         scratch[j] = x - np.float32(ix)
         scratch[BLOCK + j] = (ONE - y) * (ONE - z)
@@ -529,9 +550,9 @@ def _inverse(x):
 def _steps_to_border(u, i, count, steps_a_cell):
     """Steps from u to the end of its cell i; the outermost cells have none outwards."""
     if steps_a_cell == ZERO or i == (count - 1 if steps_a_cell > ZERO else 0):
-        return _MANY
+        return np.float32(_MANY)
     border = np.float32(i + 1) if steps_a_cell > ZERO else np.float32(i)
-    return min(max((border - u) * steps_a_cell, ZERO), _MANY)
+    return min(max((border - u) * steps_a_cell, ZERO), np.float32(_MANY))
 
 
 @inlined_kernel
