@@ -41,7 +41,7 @@ class SurfaceSettings:
     level: float | None = None
     color: str | None = "vertex"
     keep: float = 0.01
-    smoothing: int = 0
+    smoothing: int = 5
     num_faces: int | None = None
     texture_size: int = 1024
     formats: Sequence[str] = FORMATS

@@ -32,7 +32,8 @@ _SPARE = 3  # faces before a decimation for each one after it: enough to choose 
 _WINDOW = (1.5, -1.0)  # voxels along the normal between which a vertex may settle
 _SKIN = 0.025  # of the box, if that is more: how soft the skin of a body may be
 _SAMPLES = 10
-_SPREAD = 0.75  # voxels: how far the topology looks around, where vertices then settle it does not
+_SPREAD = 0.75  # voxels: how far the topology looks around; where vertices then settle does not
+_GRAIN = 128  # voxels along the longest side, at most, of which that are voxels: finer ones show a field's own grain
 _BISECTIONS = 3
 _LOOKS = (0.75, 0.0, -0.75, -1.5)  # voxels above a point of the surface where its colour is gathered
 _MATTERS = 0.02  # of a ray's light: what is stopped where less is has no visible colour
@@ -79,19 +80,14 @@ def extract_mesh(
     box = scene.box.detach().float()
     spacing = float((box[1] - box[0]).amax()) / resolution
     density = density_of(scene, spacing)
-    light = light_from_outside(
-        density_of(scene, spacing, spread=_SPREAD * spacing),
-        box,
-        resolution,
-        None if level is None else 1 - level,
-        viewpoints,
-    )
+    around = density_of(scene, spacing, spread=_SPREAD * max(1.0, resolution / _GRAIN) * spacing)
+    light = light_from_outside(around, box, resolution, None if level is None else 1 - level, viewpoints)
     if num_faces is None and color == "texture":
         num_faces = FACES_OF_A_TEXTURED_MESH
-    mesh = _without_floaters(_isosurface(light, num_faces), keep)
+    mesh = _isosurface(light, num_faces)
     if not len(mesh.faces_packed()):
         return mesh
-    mesh = _settle(mesh, density, light)
+    mesh = _without_floaters(_settle(mesh, density, light), keep)
     if num_faces is not None and len(mesh.faces_packed()) > num_faces:
         mesh = _settle(_decimate(mesh, num_faces), density, light)
     if smoothing:
