@@ -6,13 +6,31 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from rendra_lab.experiment import run
 
 CONF = Path(__file__).parents[2] / "conf"
 
-# a step of these takes a laptop minutes
-_TINY = ("data.image_size=16", "data.rays_per_step=12", "field.width=16", "callbacks.turntable.frames=0")
+# a step of these, their films and their meshes take a laptop minutes
+_SMALL_VIEWS = ("data.image_size=16", "data.counts=[4,1,1]", "data.antialias=1", "data.rays_per_step=12")
+_SMALL_SCENE = (*_SMALL_VIEWS, "callbacks.turntable.frames=2", "callbacks.surface.resolution=12")
+_TINY = (*_SMALL_SCENE, "field.width=16")
+_OF_TASKS = {
+    "nerf": _SMALL_SCENE,
+    "volume": (*_SMALL_SCENE, "volume.voxels=[6,8]", "module.refine_at=[1]"),
+}
+_OF_FIELDS = {
+    "hash_grid": ("field.encoding.log2_table_size=8", "field.width=8"),
+    "tri_plane": ("field.encoding.resolutions=[4,8]", "field.width=8"),
+    "mlp_book": ("field.width=8",),
+    "mlp_original": ("field.width=8",),
+}
+_OF_SAMPLERS = {
+    "hierarchical": ("sampler.coarse_samples=6", "sampler.fine_samples=6"),
+    "occupancy": ("sampler.cells=8", "sampler.steps_across=8"),
+    "stratified": ("sampler.samples=6",),
+}
 SMALLER = {
     "nerf_book": (*_TINY, "sampler.samples=4"),
     "nerf_book_laptop": (*_TINY, "sampler.samples=4"),
@@ -32,9 +50,54 @@ def one_step(compose: Callable[..., Any], folder: Path, *overrides: str) -> dict
 
 @pytest.mark.parametrize("task", names("task"))
 def test_every_task_makes_a_step(task: str, compose: Callable[..., Any], tmp_path: Path) -> None:
-    record = one_step(compose, tmp_path / task / "run", f"task={task}")
+    record = one_step(compose, tmp_path / task / "run", f"task={task}", *_OF_TASKS.get(task, ()))
     assert record["steps"] >= 1
     assert record["metrics"]
+
+
+@pytest.mark.parametrize("field", names("field"))
+def test_every_field_makes_a_step(field: str, compose: Callable[..., Any], tmp_path: Path) -> None:
+    settings = ("task=nerf", f"field={field}", "sampler=stratified", *_SMALL_SCENE)
+    record = one_step(
+        compose, tmp_path / "nerf" / "run", *settings, *_OF_FIELDS.get(field, ()), *_OF_SAMPLERS["stratified"]
+    )
+    assert record["metrics"]["test/psnr"] > 5
+
+
+@pytest.mark.parametrize("sampler", names("sampler"))
+@pytest.mark.parametrize("field", ["mlp_original", "tri_plane"])
+def test_every_sampler_makes_a_step(field: str, sampler: str, compose: Callable[..., Any], tmp_path: Path) -> None:
+    settings = ("task=nerf", f"sampler={sampler}", f"field={field}", *_SMALL_SCENE)
+    record = one_step(
+        compose, tmp_path / "nerf" / "run", *settings, *_OF_SAMPLERS.get(sampler, ()), *_OF_FIELDS.get(field, ())
+    )
+    assert record["metrics"]["test/psnr"] > 5
+
+
+@pytest.mark.parametrize("volume", names("volume"))
+def test_every_volume_makes_a_step_and_takes_a_second_level(
+    volume: str, compose: Callable[..., Any], tmp_path: Path
+) -> None:
+    settings = (*_OF_TASKS["volume"], "debug=fast", "trainer.max_steps=3")
+    run(compose(tmp_path / "volume" / "run", "task=volume", f"volume={volume}", *settings))
+    folder = tmp_path / "volume" / "run"
+    assert json.loads((folder / "metrics.json").read_text())["steps"] == 3
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    assert int(state["volume.level"]) == 1
+
+
+@pytest.mark.parametrize("scene_report", names("scene_report"))
+@pytest.mark.parametrize("task", sorted(set(names("task")) & set(_OF_TASKS)))
+def test_every_report_of_a_scene_stands_alone(
+    task: str, scene_report: str, compose: Callable[..., Any], tmp_path: Path
+) -> None:
+    left = {"default": "turntable.frames=2", "surface": "surface.resolution=12"}
+    settings = [word for word in _OF_TASKS[task] if not word.startswith("callbacks.")]
+    settings += ["task=" + task, f"scene_report@callbacks=[{scene_report}]", f"callbacks.{left[scene_report]}"]
+    record = one_step(compose, tmp_path / task / "run", *settings)
+    assert record["steps"] == 1
+    made = {path.name for path in (tmp_path / task / "run").rglob("*") if path.is_file()}
+    assert ("views.csv" in made) == (scene_report == "default")
 
 
 @pytest.mark.parametrize("experiment", names("experiment"))
