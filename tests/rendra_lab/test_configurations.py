@@ -2,11 +2,13 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from scene_files import blender_folder, colmap_folder, llff_folder, transforms_folder
 
 from rendra_lab.experiment import run
 
@@ -84,6 +86,32 @@ def test_every_volume_makes_a_step_and_takes_a_second_level(
     assert json.loads((folder / "metrics.json").read_text())["steps"] == 3
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     assert int(state["volume.level"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("task", "data", "make"),
+    [
+        ("nerf", "nerf_blender", blender_folder),
+        ("volume", "transforms", transforms_folder),
+        ("nerf", "colmap", partial(colmap_folder, binary=True)),
+        ("volume", "llff", llff_folder),
+        ("nerf", "llff ndc", llff_folder),
+    ],
+)
+def test_every_folder_of_a_scene_is_read_and_fitted(
+    task: str, data: str, make: Callable[[Path], Path], compose: Callable[..., Any], tmp_path: Path
+) -> None:
+    name, *bent = data.split()
+    made = {"data.image_size", "data.counts", "data.antialias", "callbacks.turntable.frames"}
+    settings = [word for word in _OF_TASKS[task] if word.partition("=")[0] not in made]
+    settings += [f"data.{word}=true" for word in bent]
+    settings += ["metric.ssim=null", "callbacks.turntable.frames=0"]  # 6 x 8 pixels are too few for its windows
+    path = make(tmp_path / "scene")
+    record = one_step(
+        compose, tmp_path / task / "run", f"task={task}", f"data={name}", f"data.path={path}", *settings
+    )
+    assert record["steps"] == 1
+    assert record["metrics"]["test/psnr"] > 3
 
 
 @pytest.mark.parametrize("scene_report", names("scene_report"))
