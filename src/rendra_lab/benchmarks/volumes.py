@@ -34,7 +34,8 @@ def _volume_step(library: Library, scene: Scene) -> Run:
     render = library.renderer.VolumeRenderer(rays, library.renderer.EmissionAbsorptionRaymarcher())
     densities = torch.full((1, *[_VOXELS] * 3), -4.0, device=scene.device, requires_grad=True)
     colours = torch.zeros((3, *[_VOXELS] * 3), device=scene.device, requires_grad=True)
-    optimizer = torch.optim.Adam([densities, colours], lr=1e-4, fused=True)  # every run starts from nearly the same volume
+    # every run starts from nearly the same volume
+    optimizer = torch.optim.Adam([densities, colours], lr=1e-4, fused=True)
     target = torch.rand(_VIEWS, _SIZE, _SIZE, 4, device=scene.device)
 
     def step() -> None:

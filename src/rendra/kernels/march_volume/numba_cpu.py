@@ -32,8 +32,7 @@ _NOTHING = np.float32(1e-20)  # light so faint that a picture needs none of it
 A3, A5, A7, A9, A11, A13 = (np.float32(1.0 / k) for k in range(3, 14, 2))
 _AT, _LEVEL = 2 * BLOCK, 3 * BLOCK  # where voxels and planes are in the whole numbers of a bench, behind samples
 _RAW, _ALPHA, _SLOPE, _WEIGHT, _VALUES = (i * BLOCK for i in range(5, 10))  # in the others; weights are first
-_RAYS_AT_ONCE = 64  # that a thread takes in turn
-_SLABS = 8  # of planes along z: what threads own in the backward pass
+_RAYS_AT_ONCE, _SLABS = 64, 8  # that a thread takes in turn; of planes along z, that it owns in the backward pass
 _NOTED = 2 * _SLABS + 2  # numbers that a ray leaves for slabs
 _BYTES_AT_ONCE = 2**22  # of gradients of samples, on their way from rays to slabs
 
@@ -559,21 +558,18 @@ def _steps_to_border(u, i, count, steps_a_cell):
 def _opacities(scratch, delta, settings):
     """The opacities of a block of samples, and their derivatives with respect to the raw values."""
     for j in range(BLOCK):
-        scratch[_ALPHA + j] = scratch[_RAW + j]
-        scratch[_SLOPE + j] = ONE
+        scratch[_ALPHA + j], scratch[_SLOPE + j] = scratch[_RAW + j], ONE
     if settings.density_activation == SIGMOID:
         for j in range(BLOCK):
             value = sigmoid(scratch[_RAW + j])
-            scratch[_ALPHA + j] = value
-            scratch[_SLOPE + j] = value * (ONE - value)
+            scratch[_ALPHA + j], scratch[_SLOPE + j] = value, value * (ONE - value)
     elif settings.density_activation == SOFTPLUS:
         for j in range(BLOCK):
             scratch[_ALPHA + j], scratch[_SLOPE + j] = _softplus(scratch[_RAW + j])
     elif settings.density_activation == EXP:
         for j in range(BLOCK):
             value = exponential(scratch[_RAW + j])
-            scratch[_ALPHA + j] = value
-            scratch[_SLOPE + j] = value
+            scratch[_ALPHA + j], scratch[_SLOPE + j] = value, value
     if settings.is_density:
         for j in range(BLOCK):
             passed = exponential(-scratch[_ALPHA + j] * delta)
@@ -587,10 +583,7 @@ def _opacities(scratch, delta, settings):
 
 @inlined_kernel
 def _softplus(x):
-    """log(1 + exp(x)) in float32, and its derivative.
-
-    log(1 + e) = 2 artanh(e / (2 + e)) for e = exp(-|x|), by its series up to the 13th power: 2e-8 relative.
-    """
+    """log(1 + exp(x)) in float32 to 2e-8 relative, and its derivative: see README.md."""
     e = exponential(-abs(x))
     s = e / (TWO + e)
     q = s * s
