@@ -17,6 +17,7 @@ from torch import Tensor
 from rendra_lab.base_task import Task
 from rendra_lab.data.ray_views import RayBatch, SceneViews
 from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, view_panels
+from rendra_lab.tasks.volume.book import BookVolume
 from rendra_lab.tasks.volume.grid import VolumeGrid
 
 
@@ -41,7 +42,7 @@ class Volume(Task[RayBatch, VolumePrediction]):
 
     def __init__(
         self,
-        volume: VolumeGrid,
+        volume: VolumeGrid | BookVolume,
         refine_at: Sequence[int] | int = (),
         look_every: int = 50,
         look_from: int = 100,
