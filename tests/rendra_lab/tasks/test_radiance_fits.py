@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from far_device import Far, far  # noqa: F401
 from lightning.pytorch import Trainer
-from torch import Tensor
+from torch import Tensor, nn
 
 from rendra.renderer import AmbientLights, TexturesVertex
 from rendra.structures import Meshes
@@ -205,6 +206,27 @@ def test_a_time_limit_ends_the_fit(name: str, scene: Scene) -> None:
 def test_the_score_is_watched_in_training(name: str, scene: Scene) -> None:
     trainer = fit(task(name), scene, 2)
     assert {"train/loss", "train/psnr", "train/loss_opacity"} <= set(trainer.callback_metrics)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_step_stays_where_its_batch_lies(far, name: str, scene: Scene) -> None:  # noqa: F811
+    toy, data = task(name), views(scene)
+    data.setup("fit")
+    batch, view = next(iter(data.train_dataloader())).to(far), data.caster.view(scene.test, 0).to(far)
+    (toy.renderer if isinstance(toy, NeRF) else toy.volume).place(scene)
+    for module in toy.modules():
+        for key, buffer in module._buffers.items():
+            module._buffers[key] = buffer.to(far)
+        for key, parameter in module._parameters.items():
+            module._parameters[key] = None if parameter is None else nn.Parameter(parameter.detach().to(far))
+    prediction = toy.predict(batch)
+    toy.objective(prediction, batch)[0].backward()
+    reached = toy.parameters() if isinstance(toy, NeRF) else [toy.volume.grid]
+    assert all(isinstance(parameter.grad, Far) for parameter in reached)
+    assert all(isinstance(panel, Far) for panel in toy.show(view).values())
+    points = torch.zeros(3, 3).to(far)
+    assert isinstance(toy.opacity_at(points, 0.1), Far)
+    assert isinstance(toy.color_at(points, points + 0.5), Far)
 
 
 @pytest.mark.parametrize("wrong", [[], [10, 20], [20, 10, 30]])
