@@ -16,7 +16,7 @@ from rendra.structures import Meshes
 from rendra.utils import ico_sphere
 from rendra_lab import losses, metrics
 from rendra_lab.base_task import Task
-from rendra_lab.data.ray_views import Scene, SceneViews
+from rendra_lab.data.ray_views import RayCaster, Scene, SceneViews
 from rendra_lab.data.rendered_scenes import RenderedScene
 from rendra_lab.networks.encodings import HashGrid, SphericalHarmonics
 from rendra_lab.networks.radiance import RadianceScene
@@ -227,6 +227,21 @@ def test_a_step_stays_where_its_batch_lies(far, name: str, scene: Scene) -> None
     points = torch.zeros(3, 3).to(far)
     assert isinstance(toy.opacity_at(points, 0.1), Far)
     assert isinstance(toy.color_at(points, points + 0.5), Far)
+
+
+def test_roughness_is_measured_now_and_then_and_counts_for_the_steps_between(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy = Volume(VolumeGrid((8,)), smooth_every=3, **parts(0.1))
+    toy.volume.place(scene)
+    monkeypatch.setattr(toy.volume, "roughness", lambda: torch.tensor(0.5))
+    batch = RayCaster(scene.box, None).pixels(scene.train, torch.arange(5))
+    found = []
+    for step in range(7):
+        monkeypatch.setattr(Volume, "global_step", step)
+        found.append(float(toy.train().predict(batch).roughness))
+        assert float(toy.eval().predict(batch).roughness) == 0
+    assert found == [1.5, 0, 0, 1.5, 0, 0, 1.5]
 
 
 @pytest.mark.parametrize("wrong", [[], [10, 20], [20, 10, 30]])

@@ -258,6 +258,14 @@ def test_cells_with_matter_are_never_emptied(voxels: int, box: tuple) -> None:
         assert 0 < float(volume.occupied.float().mean()) < 0.5
 
 
+@pytest.mark.parametrize(("opacity", "stays"), [(0.009, False), (0.011, True)])
+def test_cells_are_empty_whose_samples_stop_less_than_was_said(opacity: float, stays: bool) -> None:
+    """A sample is 2 / 15 / 2 long, and a unit 2 / 100."""
+    volume = even(-math.log1p(-opacity) * (2 / 100) / (2 / 15 / 2), voxels=(16,), empty_below=0.01)
+    volume.look_for_space()
+    assert bool(volume.occupied.all()) == stays == bool(volume.occupied.any())
+
+
 def test_cells_stay_empty_and_rays_pass_through_them() -> None:
     volume = placed(voxels=(32,))
     volume.grid.data[..., 0] = -20.0
