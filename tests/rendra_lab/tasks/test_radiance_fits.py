@@ -85,6 +85,13 @@ def task(name: str) -> Task:
     return {"nerf": nerf, "volume": volume}[name]()
 
 
+def placed(name: str, scene: Scene) -> Task:
+    """The task before its first step."""
+    untrained = task(name)
+    (untrained.renderer if isinstance(untrained, NeRF) else untrained.volume).place(scene)
+    return untrained
+
+
 def fit(toy: Task, scene: Scene, steps: int, **settings: Any) -> Trainer:
     silent = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
     checkpoint = settings.pop("ckpt_path", None)
@@ -124,9 +131,7 @@ def fitted(scene: Scene) -> Callable[[str], Task]:
 
 @pytest.mark.parametrize("name", TASKS)
 def test_a_ball_is_learned_from_its_views(name: str, scene: Scene, fitted: Callable[[str], Task]) -> None:
-    untrained = task(name)
-    (untrained.renderer if isinstance(untrained, NeRF) else untrained.volume).place(scene)
-    before, after = held_out(untrained, scene), held_out(fitted(name), scene)
+    before, after = held_out(placed(name, scene), scene), held_out(fitted(name), scene)
     least = {"nerf": 26, "volume": 31}[name]  # 28.8 and 33.6 dB; before, a grey ball: 16.5 and 17.1
     assert after > least > before + 9
 
@@ -147,11 +152,24 @@ def test_what_is_learned_is_the_ball(name: str, scene: Scene, fitted: Callable[[
     assert float((color - (outward / 2 + 0.5)).abs().median()) < 0.1
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_empty_space_is_found(name: str, fitted: Callable[[str], Task]) -> None:
-    ball = fitted(name)
-    occupied = ball.renderer.occupied if isinstance(ball, NeRF) else ball.volume.occupied
-    assert 0.1 < float(occupied.float().mean()) < 0.75
+def test_space_is_found_within_the_hull(scene: Scene, fitted: Callable[[str], Task]) -> None:
+    """The hull has cells to spare about the ball."""
+    occupied, hull = (ball.renderer.occupied for ball in (fitted("nerf"), placed("nerf", scene)))
+    assert not (occupied & ~hull).any()
+    assert 0.1 < float(occupied.sum() / hull.sum()) < 0.98
+
+
+def test_a_volume_looks_for_space_when_it_was_told(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy, looks = task("volume"), []
+    monkeypatch.setattr(toy.volume, "look_for_space", lambda: looks.append(toy.global_step))
+    fit(toy, scene, 65)
+    assert looks == [40, 50, 60]
+
+
+def test_voxels_become_finer_on_the_way(fitted: Callable[[str], Task]) -> None:
+    ball = fitted("volume")
+    assert int(ball.volume.level) == 1
+    assert max(ball.volume.grid.shape) == 24
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -210,10 +228,9 @@ def test_the_score_is_watched_in_training(name: str, scene: Scene) -> None:
 
 @pytest.mark.parametrize("name", TASKS)
 def test_a_step_stays_where_its_batch_lies(far, name: str, scene: Scene) -> None:  # noqa: F811
-    toy, data = task(name), views(scene)
+    toy, data = placed(name, scene), views(scene)
     data.setup("fit")
     batch, view = next(iter(data.train_dataloader())).to(far), data.caster.view(scene.test, 0).to(far)
-    (toy.renderer if isinstance(toy, NeRF) else toy.volume).place(scene)
     for module in toy.modules():
         for key, buffer in module._buffers.items():
             module._buffers[key] = buffer.to(far)
