@@ -1,5 +1,6 @@
 """The renderer that skips empty cells: what it sees of known matter, and what it learns about space."""
 
+import dataclasses
 import math
 
 import pytest
@@ -72,6 +73,9 @@ def opaque_scene() -> Scene:
     """Photographs without alpha: anything may be anywhere."""
     images = posed([(4, 6)], channels=3)
     return Scene(images, images.select([]), images.select([]), BOX)
+
+
+PLANK = dataclasses.replace(opaque_scene(), box=torch.tensor([[0.0] * 3, [4.0, 2.0, 1.0]]))
 
 
 def renderer(field: RadianceField, scene: Scene | None = None, **settings: object) -> OccupancyRenderer:
@@ -210,14 +214,15 @@ def refreshed(made: OccupancyRenderer, first: int, looks: int) -> None:
 
 def middles(made: OccupancyRenderer) -> Tensor:
     """Of cells: (D, H, W, 3)."""
-    axes = [(torch.arange(size) + 0.5) / size * 2 - 1 for size in made.occupied.shape]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).flip(-1)
+    low, high = made.field.box
+    shares = [(torch.arange(size) + 0.5) / size for size in made.occupied.shape]
+    return low + torch.stack(torch.meshgrid(*shares, indexing="ij"), dim=-1).flip(-1) * (high - low)
 
 
 def assert_holds(made: OccupancyRenderer, ball: Ball) -> None:
     """All of the ball, and nothing that is two cells away from it."""
     apart = (middles(made) - ball.centre).norm(dim=-1) - ball.radius
-    cell = 2 / made.cells
+    cell = float((made.field.box[1] - made.field.box[0]).amax()) / made.cells
     assert made.occupied[apart < 0].all()  # also those of which a look at one point saw none of it
     assert not made.occupied[apart > 3 * math.sqrt(3) * cell].any()
 
@@ -250,6 +255,13 @@ def test_moving_matter_is_followed() -> None:
     assert made.occupied[(both - made.field.centre).norm(dim=-1) < 0.15].all()
     assert made.occupied[(both + torch.tensor([0.4, 0.0, 0.0])).norm(dim=-1) < 0.15].all()  # remembered for a while
     refreshed(made, 176, 12)
+    assert_holds(made, made.field)
+
+
+def test_cells_lie_where_their_matter_is() -> None:
+    """In a box whose sides differ."""
+    made = renderer(Ball(50.0, (3.2, 0.6, 0.5), 0.4), PLANK, cells=32, empty_from=0)
+    refreshed(made, 16, 3)
     assert_holds(made, made.field)
 
 
@@ -292,11 +304,9 @@ def test_points_are_looked_at_where_cells_are_not_empty(silhouettes: Scene) -> N
 
 
 def test_cells_are_about_cubes() -> None:
-    scene = opaque_scene()
-    plank = Scene(scene.train, scene.val, scene.test, torch.tensor([[0.0] * 3, [4.0, 2.0, 1.0]]))
-    made = renderer(Fog(), plank)
+    made = renderer(Fog(), PLANK)
     assert made.occupied.shape == made.usual.shape == (4, 8, 16)
-    assert_close(made.field.box, plank.box)
+    assert_close(made.field.box, PLANK.box)
     assert made.step_length == pytest.approx(4 / 64)
 
 
