@@ -18,10 +18,11 @@ CONF = Path(__file__).parents[2] / "conf"
 _SMALL_VIEWS = ("data.image_size=16", "data.counts=[4,1,1]", "data.antialias=1", "data.rays_per_step=12")
 _SMALL_SCENE = (*_SMALL_VIEWS, "callbacks.turntable.frames=2", "callbacks.surface.resolution=12")
 _TINY = (*_SMALL_SCENE, "field.width=16")
-_OF_TASKS = {
-    "nerf": _SMALL_SCENE,
-    "volume": (*_SMALL_SCENE, "volume.voxels=[6,8]", "module.refine_at=[1]"),
+_OF_VOLUMES = {
+    "book": ("volume.voxels=8", "volume.samples=6", "module.refine_at=[]"),
+    "grid": ("volume.voxels=[6,8]", "module.refine_at=[1]"),
 }
+_OF_TASKS = {"nerf": _SMALL_SCENE, "volume": (*_SMALL_SCENE, *_OF_VOLUMES["grid"])}
 _OF_FIELDS = {
     "hash_grid": ("field.encoding.log2_table_size=8", "field.width=8"),
     "tri_plane": ("field.encoding.resolutions=[4,8]", "field.width=8"),
@@ -34,6 +35,7 @@ _OF_SAMPLERS = {
     "stratified": ("sampler.samples=6",),
 }
 SMALLER = {
+    "volume_book": (*_SMALL_SCENE, *_OF_VOLUMES["book"]),
     "nerf_book": (*_TINY, "sampler.samples=4"),
     "nerf_book_laptop": (*_TINY, "sampler.samples=4"),
     "nerf_original": (*_TINY, "sampler.fine_samples=4"),
@@ -77,15 +79,15 @@ def test_every_sampler_makes_a_step(field: str, sampler: str, compose: Callable[
 
 
 @pytest.mark.parametrize("volume", names("volume"))
-def test_every_volume_makes_a_step_and_takes_a_second_level(
+def test_every_volume_makes_steps_at_all_of_its_levels(
     volume: str, compose: Callable[..., Any], tmp_path: Path
 ) -> None:
-    settings = (*_OF_TASKS["volume"], "debug=fast", "trainer.max_steps=3")
-    run(compose(tmp_path / "volume" / "run", "task=volume", f"volume={volume}", *settings))
+    settings = (*_SMALL_SCENE, *_OF_VOLUMES.get(volume, ()), "debug=fast", "trainer.max_steps=3")
     folder = tmp_path / "volume" / "run"
+    run(compose(folder, "task=volume", f"volume={volume}", *settings))
     assert json.loads((folder / "metrics.json").read_text())["steps"] == 3
     state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-    assert int(state["volume.level"]) == 1
+    assert int(state["volume.level"]) == (1 if volume == "grid" else 0)
 
 
 @pytest.mark.parametrize(

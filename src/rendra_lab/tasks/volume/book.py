@@ -5,6 +5,8 @@ Shapes: Q rays, M points, n voxels along each side.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -37,7 +39,7 @@ class BookVolume(nn.Module):
         voxels: int = 128,
         side: float = 3.0,
         samples: int = 150,
-        depth_range: tuple[float, float] = (0.1, 3.0),
+        depth_range: Sequence[float] = (0.1, 3.0),
         start: float = -4.0,
         rays_at_once: int = 65536,
     ) -> None:
