@@ -30,7 +30,7 @@ _OF_FIELDS = {
     "mlp_original": ("field.width=8",),
 }
 _OF_SAMPLERS = {
-    "hierarchical": ("sampler.coarse_samples=6", "sampler.fine_samples=6"),
+    "hierarchical": ("sampler.coarse_samples=6", "sampler.fine_samples=6", "loss=[rgb,rgb_coarse,opacity]"),
     "occupancy": ("sampler.cells=8", "sampler.steps_across=8"),
     "stratified": ("sampler.samples=6",),
 }

@@ -11,10 +11,13 @@ from torch.nn import functional as F
 
 from rendra.renderer import EmissionAbsorptionRaymarcher
 from rendra_lab.errors import UserError
+from rendra_lab.losses import SquaredError
 from rendra_lab.networks.radiance import Rays
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.mlp_fields import MLPBook, MLPOriginal
 from rendra_lab.tasks.nerf.samplers import HierarchicalRenderer, StratifiedRenderer, composite
+from rendra_lab.tasks.nerf.task import NeRF
+from rendra_lab.terms import LossTerm
 
 
 class Fog(RadianceField):
@@ -224,3 +227,10 @@ def test_rays_are_followed_where_they_lie(far, make: type) -> None:  # noqa: F81
     assert all(isinstance(parameter.grad, Far) for parameter in renderer.parameters())
     with torch.no_grad():
         assert isinstance(renderer.eval()(rays).depth, Far)
+
+
+def test_a_coarse_field_wants_a_loss() -> None:
+    renderer = HierarchicalRenderer(Fog(), Fog())
+    loss = {"rgb": LossTerm(SquaredError())}
+    with pytest.raises(UserError, match=r"loss=\[rgb,rgb_coarse,opacity\]"):
+        NeRF(renderer, losses=loss, optimizer=torch.optim.Adam)

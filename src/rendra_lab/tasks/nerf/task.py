@@ -13,8 +13,10 @@ from torch import Tensor
 
 from rendra_lab.base_task import Task
 from rendra_lab.data.ray_views import RayBatch, SceneViews
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, view_panels
 from rendra_lab.tasks.nerf.renderers import RayRenderer
+from rendra_lab.tasks.nerf.samplers import HierarchicalRenderer
 
 
 class NeRF(Task[RayBatch, RadiancePrediction]):
@@ -23,11 +25,19 @@ class NeRF(Task[RayBatch, RadiancePrediction]):
     Args:
         renderer: asks a field about rays.
         **parts: losses, metrics, optimizer, scheduler of `Task`.
+
+    Raises:
+        UserError: a coarse field that no loss looks at.
     """
 
     def __init__(self, renderer: RayRenderer, **parts: Any) -> None:
         super().__init__(**parts)
         self.renderer = renderer
+        read = {term.prediction for _, term in self._weighted()}
+        if isinstance(renderer, HierarchicalRenderer) and "rgb_coarse" not in read:
+            raise UserError(
+                "sampler=hierarchical has a coarse field, which no loss trains: say loss=[rgb,rgb_coarse,opacity]"
+            )
 
     def predict(self, batch: RayBatch) -> RadiancePrediction:
         """What the rays of a batch see."""
