@@ -322,6 +322,11 @@ class SceneViews(LightningDataModule, ABC):
         return self.sides[-1][1]
 
     @property
+    def test_labels(self) -> tuple[str, ...]:
+        """What the test images are called, in the order of the test batches."""
+        return self.scene.test.labels
+
+    @property
     def caster(self) -> RayCaster:
         """Makes the rays of whole views."""
         return self._caster(self.final_side)
