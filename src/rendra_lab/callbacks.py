@@ -230,9 +230,9 @@ class MeshLogger(Callback):
     def _show(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         assert isinstance(pl_module, BaseTask)
         shown = pl_module.show_meshes(self._batch)
-        for writer in _writers(trainer):
+        for writer in writers(trainer):
             for name, meshes in shown.items():
-                _add_mesh(writer, name, meshes, trainer.global_step)
+                add_mesh(writer, name, meshes, trainer.global_step)
         return shown
 
 
@@ -378,11 +378,12 @@ def _publish(trainer: Trainer, pictures: dict[str, np.ndarray], tag: str, path: 
         return
     sheet = visualization.captioned_row(pictures)
     visualization.save_picture(path, sheet)
-    for writer in _writers(trainer):
+    for writer in writers(trainer):
         writer.add_image(tag, sheet, trainer.global_step, dataformats="HWC")
 
 
-def _add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:
+def add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:
+    """Shows meshes in TensorBoard, with their colours where they are at the vertices."""
     colors = None
     if meshes.textures is not None and hasattr(meshes.textures, "verts_features_padded"):
         colors = (meshes.textures.verts_features_padded()[..., :3].detach().clamp(0, 1) * 255).round().int()
@@ -407,7 +408,8 @@ def _pictures(pl_module: LightningModule, batch: Any) -> dict[str, np.ndarray]:
     return {name: visualization.to_picture(torch.as_tensor(image)) for name, image in pl_module.show(batch).items()}
 
 
-def _writers(trainer: Trainer) -> list[Any]:
+def writers(trainer: Trainer) -> list[Any]:
+    """Those of TensorBoard's event files."""
     return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoard)]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from time import perf_counter
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -13,7 +12,7 @@ from rendra_lab.base_task import BaseTask
 from rendra_lab.data.ray_views import SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
-from rendra_lab.radiance_film import SHOWN, can_write_mp4, film, path_caster
+from rendra_lab.radiance_film import SHOWN, can_write_mp4, shoot
 from rendra_lab.trajectories import WAYS, trajectory
 from rendra_lab.visualization import Picture, save_animation
 
@@ -68,19 +67,14 @@ class Turntable(Callback):
             return
         assert isinstance(pl_module, BaseTask)
         cameras = trajectory(self.trajectory, data.scene, self.frames, self.size, self.elevation_deg)
-        begun = perf_counter()
-        films = film(pl_module, path_caster(data), cameras, self.shown)
-        seconds = perf_counter() - begun
-        self._write(trainer, films)
-        height, width = cameras.sizes[0].tolist()
-        speed = len(cameras) / seconds
-        files = ", ".join(f"{_FILES[name]}.gif" for name in films)
+        shot = shoot(pl_module, data, cameras, self.shown)
+        self._write(trainer, shot.films)
+        files = ", ".join(f"{_FILES[name]}.gif" for name in shot.films)
         video = "and .mp4" if can_write_mp4() else "; no .mp4 without the extra [view]"
-        report.say(
-            f"{len(cameras)} frames of {width}x{height} rendered in {seconds:.1f} s, {speed:.0f}/s: {files} {video}"
-        )
+        report.say(f"{shot}: {files} {video}")
         for logger in trainer.loggers:
-            logger.log_metrics({"film/seconds": seconds, "film/frames_per_s": speed}, trainer.global_step)
+            figures = {"film/seconds": shot.seconds, "film/frames_per_s": shot.frames_per_s}
+            logger.log_metrics(figures, trainer.global_step)
 
     def _write(self, trainer: Trainer, films: Mapping[str, Sequence[Picture]]) -> None:
         for name, frames in films.items():

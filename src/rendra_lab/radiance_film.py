@@ -93,6 +93,44 @@ def film(
 
 
 @dataclass(frozen=True)
+class Shot:
+    """The frames of a way through a scene, and what they took.
+
+    Attributes:
+        films: frames by word of SHOWN.
+        size: height and width of a frame in pixels.
+        seconds: of the rendering.
+    """
+
+    films: dict[str, list[Picture]]
+    size: tuple[int, int]
+    seconds: float
+
+    @property
+    def count(self) -> int:
+        """Frames of each film."""
+        return len(next(iter(self.films.values())))
+
+    @property
+    def frames_per_s(self) -> float:
+        """How fast they were rendered."""
+        return self.count / self.seconds
+
+    def __str__(self) -> str:
+        """One line for people."""
+        height, width = self.size
+        return f"{self.count} frames of {width}x{height} rendered in {self.seconds:.1f} s, {self.frames_per_s:.0f}/s"
+
+
+def shoot(task: BaseTask[RayBatch, Any], data: SceneViews, cameras: PosedImages, shown: Sequence[str]) -> Shot:
+    """Films a fitted scene from cameras, by the clock; see `film`."""
+    begun = perf_counter()
+    films = film(task, path_caster(data), cameras, shown)
+    height, width = cameras.sizes[0].tolist()
+    return Shot(films, (height, width), perf_counter() - begun)
+
+
+@dataclass(frozen=True)
 class FilmOrder:
     """What to film, and where to.
 
@@ -154,10 +192,8 @@ def render_run(task: Any, data: Any, order: FilmOrder) -> tuple[str, Path]:
     if not isinstance(data, SceneViews):
         raise UserError(f"run: {type(task).__name__} fits no scene that can be filmed; take a run of nerf or volume")
     cameras = trajectory(order.trajectory, data.scene, order.frames, order.size, order.elevation_deg)
-    begun = perf_counter()
-    films = film(task, path_caster(data), cameras, order.shown)
-    seconds = perf_counter() - begun
-    rows = [dict(zip(films, row, strict=True)) for row in zip(*films.values(), strict=True)]
+    shot = shoot(task, data, cameras, order.shown)
+    rows = [dict(zip(shot.films, row, strict=True)) for row in zip(*shot.films.values(), strict=True)]
     frames = [captioned_row(row) if len(row) > 1 else next(iter(row.values())) for row in rows]
     output = order.file()
     if output.suffix:
@@ -165,11 +201,7 @@ def render_run(task: Any, data: Any, order: FilmOrder) -> tuple[str, Path]:
     else:
         for index, frame in enumerate(frames):
             save_picture(output / f"frame_{index:04d}.png", frame)
-    height, width = cameras.sizes[0].tolist()
-    return (
-        f"{len(frames)} frames of {width}x{height} rendered in {seconds:.1f} s, {len(frames) / seconds:.0f}/s",
-        output,
-    )
+    return str(shot), output
 
 
 def can_write_mp4() -> bool:

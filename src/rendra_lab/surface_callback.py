@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from rendra.structures import Meshes
 from rendra_lab import report
+from rendra_lab.callbacks import add_mesh, writers
 from rendra_lab.data.ray_views import SceneViews
-from rendra_lab.loggers import TensorBoard
 from rendra_lab.mesh_export import SurfaceSettings, export_surface
 from rendra_lab.metrics import surface_chamfer_l1
 from rendra_lab.networks.radiance import RadianceScene
@@ -63,16 +61,5 @@ class SurfaceExporter(Callback):
         if data.scene.truth is not None:
             distance = surface_chamfer_l1(written.mesh, data.scene.truth.to(written.mesh.device))
             pl_module.log("test/mesh_chamfer_l1", distance, rank_zero_only=True)
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoard):
-                _show(logger.experiment, written.mesh, trainer.global_step)
-
-
-def _show(writer: Any, mesh: Meshes, step: int) -> None:
-    """A mesh, with its colours where they are at its vertices."""
-    colors = None
-    if mesh.textures is not None and hasattr(mesh.textures, "verts_features_padded"):
-        colors = (mesh.textures.verts_features_padded() * 255).round().int().cpu()
-    writer.add_mesh(
-        "surface", mesh.verts_padded().cpu(), faces=mesh.faces_padded().cpu(), colors=colors, global_step=step
-    )
+        for writer in writers(trainer):
+            add_mesh(writer, "surface", written.mesh, trainer.global_step)

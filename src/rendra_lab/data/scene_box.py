@@ -82,6 +82,13 @@ def has_silhouettes(images: PosedImages) -> bool:
     return 2 * sum(0 < share < 0.98 for share in shares) >= max(1, len(shares))
 
 
+def cells_along(box: Tensor, across: int, least: int = 1) -> tuple[int, int, int]:
+    """Cells along z, y and x of a box (2, 3), about cubes: `across` along its longest side, `least` at least."""
+    sides = box[1] - box[0]
+    x, y, z = (max(least, round(across * float(side / sides.amax()))) for side in sides)
+    return z, y, x
+
+
 def carve(images: PosedImages, box: Tensor, resolution: int | tuple[int, int, int]) -> Tensor:
     """Which cells of a box may hold anything, judged by the silhouettes.
 

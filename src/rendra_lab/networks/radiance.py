@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -84,6 +84,12 @@ class RadianceScene(Protocol):
 
     def color_at(self, points: Float[Tensor, "M 3"], directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
         """The light, sRGB in [0, 1], that leaves the points against rays of such unit directions."""
+
+
+def in_pieces(render: Callable[[Rays], RaysSeen], rays: Rays, at_once: int) -> RaysSeen:
+    """What rays see, so many rendered together: the same as all at once, in bounded memory."""
+    starts = range(0, max(len(rays.nearest), 1), at_once)
+    return RaysSeen.join([render(rays.slice(first, first + at_once)) for first in starts])
 
 
 def mean_over_rays(seen: RaysSeen, batch: RayBatch) -> RadiancePrediction:

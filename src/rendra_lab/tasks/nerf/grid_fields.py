@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from rendra.kernels.composite import alphas_of
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 _LARGEST_EXPONENT = 12.0  # exp(12) per unit of length is opaque at every step anybody takes
@@ -55,7 +56,7 @@ class GridField(RadianceField):
         width: of the hidden layers.
         density_layers: hidden layers between the features and the density.
         color_layers: hidden layers between the density's features and the light.
-        memory: features that the density network hands on to the light's, besides the encoding's own.
+        memory: features that the density network hands on to the light's.
         start_density: everywhere, before training, in units of 1 / (longest side of the box).
     """
 
@@ -99,7 +100,7 @@ class GridField(RadianceField):
     def _alpha(self, raw: Tensor, steps: Tensor) -> Tensor:
         size = (self.box[1] - self.box[0]).amax()
         density = _TruncatedExp.apply(raw) * (self.start_density / size)
-        return -torch.expm1(-density * steps)
+        return alphas_of(density, steps)
 
 
 def perceptron(widths: Sequence[int]) -> nn.Sequential:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
+from rendra.kernels.composite import alphas_of
 from rendra_lab.errors import UserError
 from rendra_lab.tasks.nerf.fields import RadianceField
 
@@ -197,7 +198,7 @@ class MLPOriginal(MLPField):
         if self.training and self.noise_std > 0:
             matter = matter + self.noise_std * torch.randn_like(matter)
         lengths = steps / self._unit() if self.normalize else steps
-        return -torch.expm1(-matter.relu() * lengths)
+        return alphas_of(matter.relu(), lengths)
 
     def _unit(self) -> Tensor:
         """Half of the longest side of the box."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from rendra.kernels.composite import compact, composite_alphas, visible
 from rendra.kernels.occupancy import cells_of, dilate, traverse
 from rendra_lab.data.ray_views import Scene
-from rendra_lab.data.scene_box import carve
+from rendra_lab.data.scene_box import carve, cells_along
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
 from rendra_lab.tasks.nerf.fields import RadianceField
@@ -93,9 +93,8 @@ class OccupancyRenderer(RayRenderer):
         if bool(self.is_placed):
             return
         super().place(scene)
-        sides = scene.box[1] - scene.box[0]
-        x, y, z = (max(1, round(self.cells * float(side / sides.amax()))) for side in sides)
-        self.hull = carve(scene.train, scene.box.cpu(), (z, y, x)).to(self.hull.device)
+        shape = cells_along(scene.box, self.cells)
+        self.hull = carve(scene.train, scene.box.cpu(), shape).to(self.hull.device)
         self.occupied = self.hull.clone()
         self.largest = torch.zeros(self.hull.shape, device=self.hull.device)
         self.usual = torch.zeros_like(self.largest)

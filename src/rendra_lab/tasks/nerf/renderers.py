@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from rendra_lab.data.ray_views import Scene
-from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 
@@ -35,12 +35,7 @@ class RayRenderer(nn.Module, ABC):
         """What rays see; piece by piece, to bounded memory, where no gradient is wanted."""
         if torch.is_grad_enabled():
             return self.render(rays)
-        count = len(rays.nearest)
-        pieces = [
-            self.render(rays.slice(first, first + self.rays_at_once))
-            for first in range(0, max(count, 1), self.rays_at_once)
-        ]
-        return RaysSeen.join(pieces)
+        return in_pieces(self.render, rays, self.rays_at_once)
 
     def place(self, scene: Scene) -> None:
         """Say where the scene lies, before the first step."""

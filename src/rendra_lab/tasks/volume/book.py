@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene
-from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 
 
 class BookVolume(nn.Module):
@@ -77,8 +77,7 @@ class BookVolume(nn.Module):
     def forward(self, rays: Rays) -> RaysSeen:
         """What rays see, piece by piece."""
         grid = self.raw.sigmoid()
-        pieces = range(0, max(len(rays.nearest), 1), self.rays_at_once)
-        return RaysSeen.join([self._march(grid, rays.slice(first, first + self.rays_at_once)) for first in pieces])
+        return in_pieces(lambda some: self._march(grid, some), rays, self.rays_at_once)
 
     def read(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Opacity of a sample (M,) and colour (M, 3) at points (M, 3) of the world."""

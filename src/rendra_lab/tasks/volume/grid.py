@@ -17,8 +17,8 @@ from torch.nn import functional as F
 
 from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene, within_box
-from rendra_lab.data.scene_box import carve
-from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.data.scene_box import carve, cells_along
+from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
 _SHORTEST = 1e-9  # step of a ray without length, as a share of others
@@ -104,11 +104,11 @@ class VolumeGrid(nn.Module):
         self.box.copy_(scene.box)
         raw = torch.tensor(self.start_density).expm1().log()
         for grid, voxels in zip(self.grids, self.voxels, strict=True):
-            shape = self._shape(voxels)
+            shape = cells_along(self.box, voxels, least=2)
             # NumPy's memory comes in large pages: rays miss the translation cache less
             grid.data = torch.from_numpy(np.zeros((1, *shape, 4), np.float32)).to(self.box.device)
             grid.data[..., 0] = raw
-        hull = carve(scene.train, scene.box.cpu(), self._shape(_CELLS_ACROSS))
+        hull = carve(scene.train, scene.box.cpu(), cells_along(self.box, _CELLS_ACROSS, least=2))
         self.occupied = hull.to(self.box.device, torch.uint8)
         self.is_placed.fill_(True)
 
@@ -171,9 +171,7 @@ class VolumeGrid(nn.Module):
         """What rays see: jittered while training, piece by piece where no gradient is wanted."""
         if torch.is_grad_enabled():
             return self.render(rays, jitter=self.training)
-        count = len(rays.nearest)
-        starts = range(0, max(count, 1), self.rays_at_once)
-        return RaysSeen.join([self.render(rays.slice(first, first + self.rays_at_once)) for first in starts])
+        return in_pieces(self.render, rays, self.rays_at_once)
 
     def roughness(self, share: float = 0.125) -> Tensor:
         """Total variation: mean squared difference of neighbours in a random slab of the volume, a share of it."""
@@ -210,9 +208,3 @@ class VolumeGrid(nn.Module):
 
     def _delta(self) -> float:
         return self._step() / self._unit()
-
-    def _shape(self, across: int) -> tuple[int, int, int]:
-        """Voxels along z, y and x, about cubes, with so many along the longest side."""
-        sides = self.box[1] - self.box[0]
-        x, y, z = (max(2, round(across * float(side / sides.amax()))) for side in sides)
-        return z, y, x
