@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import difflib
+import gc
 import os
 import re
 import sys
@@ -40,6 +42,7 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         config_name: of the primary configuration.
     """
     verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    atexit.register(gc.freeze)  # or the interpreter's last collection walks all that was imported, for a second
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands its exceptions over instead of printing them
     FailureKeeper.active = True
     try:

@@ -189,6 +189,7 @@ def test_where_there_is_nothing_nothing_is_seen(grad: bool, looks_first: bool) -
         assert_close(seen.rgb[:3], torch.zeros(3, 3))
         assert_close(seen.rgb[3:], whole.rgb[3:])
         made.occupied.zero_()
+        made.solid.zero_()
         seen = made(rays)
         for name in ("rgb", "opacity", "depth"):
             assert_close(getattr(seen, name), torch.zeros_like(getattr(seen, name)))
@@ -234,6 +235,15 @@ def test_space_is_full_until_it_may_be_empty() -> None:
     made.refresh(64)
     assert not made.occupied.all()
     assert_holds(made, made.field)
+
+
+def test_a_finished_scene_is_shown_without_the_neighbours_of_its_cells() -> None:
+    made = renderer(Ball(50.0), empty_from=0)
+    refreshed(made, 0, 4)
+    assert (made.solid <= made.occupied).all() and made.solid.any() and not torch.equal(made.solid, made.occupied)
+    made.solid.zero_()
+    assert made.train()(through(6)).opacity.any()
+    assert not made.eval()(through(6)).opacity.any()
 
 
 def test_cells_are_looked_at_now_and_then() -> None:

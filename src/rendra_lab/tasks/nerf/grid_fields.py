@@ -107,5 +107,5 @@ def perceptron(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers of these widths with ReLU between them, without biases."""
     layers: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):
-        layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU()]
+        layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])

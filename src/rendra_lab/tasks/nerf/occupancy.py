@@ -28,7 +28,8 @@ class OccupancyRenderer(RayRenderer):
 
     Cells start as the visual hull of the silhouettes, where images have them, and are looked at again in the course
     of training: those that have become empty are skipped, and the mean opacity of the others tells how far light
-    comes. What may be lit after that is asked of the field.
+    comes. What may be lit after that is asked of the field. Training also looks at the neighbours of the cells that
+    are not empty, so that matter can grow; a finished scene is shown without them: they hold but specks.
 
     Args:
         field: see `RayRenderer`.
@@ -45,7 +46,8 @@ class OccupancyRenderer(RayRenderer):
         rays_at_once: see `RayRenderer`.
     """
 
-    occupied: Tensor  # (D, H, W) bool
+    occupied: Tensor  # (D, H, W) bool: the cells that training looks at: those of `solid`, and their neighbours
+    solid: Tensor  # (D, H, W) bool: the cells in which something was found of late, all that is looked at afterwards
     hull: Tensor  # (D, H, W) bool: outside it there is nothing, ever
     largest: Tensor  # (D, H, W) opacity of a sample in a cell, the largest of late
     usual: Tensor  # (D, H, W) its mean of late
@@ -82,7 +84,7 @@ class OccupancyRenderer(RayRenderer):
         self.stop_below = stop_below
         self.looks_first = looks_first
         self.jitter = jitter
-        for name in ("occupied", "hull"):
+        for name in ("occupied", "solid", "hull"):
             self.register_buffer(name, torch.ones(1, 1, 1, dtype=torch.bool))
         for name in ("largest", "usual"):
             self.register_buffer(name, torch.zeros(1, 1, 1))
@@ -95,7 +97,7 @@ class OccupancyRenderer(RayRenderer):
         super().place(scene)
         shape = cells_along(scene.box, self.cells)
         self.hull = carve(scene.train, scene.box.cpu(), shape).to(self.hull.device)
-        self.occupied = self.hull.clone()
+        self.occupied, self.solid = self.hull.clone(), self.hull.clone()
         self.largest = torch.zeros(self.hull.shape, device=self.hull.device)
         self.usual = torch.zeros_like(self.largest)
         self.is_placed.fill_(True)
@@ -116,7 +118,8 @@ class OccupancyRenderer(RayRenderer):
         self.largest[self.hull] = torch.maximum(found, self.decay * largest)
         self.usual[self.hull] = torch.lerp(found, usual, self.decay) if step > self.refresh_every else found
         if step >= self.empty_from:
-            self.occupied = dilate(self.largest > self.empty_below) & self.hull
+            self.solid = (self.largest > self.empty_below) & self.hull
+            self.occupied = dilate(self.solid) & self.hull
 
     @property
     def step_length(self) -> float:
@@ -128,10 +131,17 @@ class OccupancyRenderer(RayRenderer):
         offset = (
             torch.rand_like(rays.nearest) if self.jitter and self.training else torch.full_like(rays.nearest, 0.5)
         )
+        cells = self.occupied if self.training else self.solid
         samples = traverse(
-            rays.origins, rays.directions, rays.nearest, rays.farthest, self.occupied, self.field.box,
-            self.step_length, offset,
-        )  # fmt: skip
+            rays.origins,
+            rays.directions,
+            rays.nearest,
+            rays.farthest,
+            cells,
+            self.field.box,
+            self.step_length,
+            offset,
+        )
         points, middles, lengths = self._points(rays, samples.starts, samples.ends, samples.ray_index)
         with torch.no_grad():
             lit = visible(self._usual_at(points), samples.ray_first, self.stop_below)
@@ -162,7 +172,7 @@ class OccupancyRenderer(RayRenderer):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""
-        for name in ("occupied", "hull", "largest", "usual"):
+        for name in ("occupied", "solid", "hull", "largest", "usual"):
             if prefix + name in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.hull.device))
         super()._load_from_state_dict(state_dict, prefix, *args)
