@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 import warnings
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +28,16 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from rendra_lab import report
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import StepTimer
+from rendra_lab.checkpoints import (
+    checkpoints_are_data,
+    find_checkpoint,
+    named_checkpoint,
+    newest_checkpoint,
+    whole,
+)
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
+from rendra_lab.settings import check_run
 from rendra_lab.targets import check_targets
 
 log = logging.getLogger(__name__)
@@ -74,7 +81,9 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     Raises UserError for a forbidden `_target_` or an argument that it does not take, naming the key.
     """
     quieten()
-    check_targets(OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True))
+    tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    check_run(tree)
+    check_targets(tree)
     if cfg.threads is not None:
         torch.set_num_threads(int(cfg.threads))
     seed_everything(_seed(cfg), workers=True, verbose=False)
@@ -105,7 +114,7 @@ def run(cfg: DictConfig) -> float | None:
     record = _opening_record(cfg)
     try:
         experiment = build(cfg)
-        checkpoint = _whole(find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root)))
+        checkpoint = whole(find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root)))
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
         with _own_processes(experiment):
@@ -152,8 +161,8 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
     for key, value in (overrides or {}).items():
         OmegaConf.update(cfg, key, value)
     experiment = build(cfg, observers=False)
-    checkpoint = newest_checkpoint(folder) if weights == "last" else _named_checkpoint(folder, weights)
-    _whole(checkpoint)
+    checkpoint = newest_checkpoint(folder) if weights == "last" else named_checkpoint(folder, weights)
+    whole(checkpoint)
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     experiment.data.prepare_data()
     experiment.data.setup("test")
@@ -168,35 +177,6 @@ def evaluate(experiment: Experiment) -> dict[str, float]:
         raise UserError(f"{type(experiment.data).__name__} has no test data")
     experiment.trainer.test(experiment.task, datamodule=experiment.data, verbose=False)
     return _numbers(experiment.trainer)
-
-
-def find_checkpoint(wanted: str | None, run_folder: Path, output_root: Path) -> Path | None:
-    """The checkpoint to resume from: None, a file, the newest of a run folder, or `last` of the same task."""
-    if wanted is None:
-        return None
-    if wanted == "last":
-        return newest_checkpoint(_task_folder(run_folder, output_root), besides=run_folder)
-    path = Path(wanted)
-    if path.is_dir():
-        return newest_checkpoint(path)
-    if not path.is_file():
-        raise UserError(f"ckpt_path: there is neither a checkpoint nor a run folder at {wanted}")
-    return path
-
-
-def newest_checkpoint(folder: Path, besides: Path | None = None) -> Path:
-    """The checkpoint written last in any run under `folder`, except the run `besides`."""
-    found = [path for path in folder.rglob("checkpoints/*.ckpt") if besides is None or besides not in path.parents]
-    if not found:
-        raise UserError(f"there is no checkpoint under {report.short_path(folder)}; start without ckpt_path")
-    return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name == "last.ckpt"))
-
-
-def _whole(checkpoint: Path | None) -> Path | None:
-    """The checkpoint itself, if its archive has an end."""
-    if checkpoint is not None and not zipfile.is_zipfile(checkpoint):
-        raise UserError(f"ckpt_path: {checkpoint} is cut off, or no checkpoint: take an older one of its folder")
-    return checkpoint
 
 
 def _interruption(error: BaseException) -> int | None:
@@ -227,31 +207,17 @@ class _Clock:
 
 def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock) -> dict[str, float]:
     trainer, task, data = experiment.trainer, experiment.task, experiment.data
-    with _checkpoints_are_data():
+    with checkpoints_are_data():
         trainer.fit(task, datamodule=data, ckpt_path=None if checkpoint is None else str(checkpoint))
     clock.lap("fit")
     metrics = _numbers(trainer)
     if experiment.cfg.test is not None and _has_test(data):
         best = _best_checkpoint(trainer) if experiment.cfg.test == "best" else None
-        with _checkpoints_are_data():
+        with checkpoints_are_data():
             trainer.test(task, datamodule=data, ckpt_path=best, verbose=False)
         metrics.update(_numbers(trainer))
         clock.lap("test")
     return metrics
-
-
-@contextlib.contextmanager
-def _checkpoints_are_data() -> Iterator[None]:
-    """Whatever is loaded meanwhile is read as tensors and plain values; a file cannot run code."""
-    name = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
-    before = os.environ.get(name)
-    os.environ[name] = "1"
-    try:
-        yield
-    finally:
-        os.environ.pop(name)
-        if before is not None:
-            os.environ[name] = before
 
 
 @contextlib.contextmanager
@@ -301,22 +267,6 @@ def _best_checkpoint(trainer: Trainer) -> str:
         if isinstance(keeper, ModelCheckpoint) and keeper.monitor and keeper.best_model_path:
             return keeper.best_model_path
     raise UserError("test=best needs callbacks=[default,best], callbacks.best.monitor=val/..., and a validation")
-
-
-def _named_checkpoint(folder: Path, weights: str) -> Path:
-    path = folder / "checkpoints" / "best.ckpt" if weights == "best" else Path(weights)
-    if not path.is_file():
-        raise UserError(f"there is no checkpoint at {path}; say last, best or a file")
-    return path
-
-
-def _task_folder(run_folder: Path, output_root: Path) -> Path:
-    """outputs/<task>, for a run directly in it and for a job of a sweep."""
-    try:
-        relative = run_folder.resolve().relative_to(output_root.resolve())
-    except ValueError:
-        return run_folder.parent
-    return output_root / relative.parts[0] if len(relative.parts) > 1 else run_folder.parent
 
 
 def _has_test(data: LightningDataModule) -> bool:

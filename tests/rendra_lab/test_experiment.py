@@ -14,8 +14,9 @@ from omegaconf import OmegaConf
 from rendra_lab_toy import ToyTask
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from rendra_lab.checkpoints import find_checkpoint
 from rendra_lab.errors import UserError
-from rendra_lab.experiment import build, evaluate, find_checkpoint, load_run, run
+from rendra_lab.experiment import build, evaluate, load_run, run
 from rendra_lab.targets import check_targets
 
 Compose = Callable[..., Any]
