@@ -24,13 +24,24 @@ def _ball(device: torch.device) -> Tensor:
 
 def _occupancy(library: Library, scene: Scene) -> Run:
     """Rays from a sphere of radius 3 towards points of the box, 16 samples a ray or so."""
+    return _traversal(scene, stop_below=0.0)
+
+
+def _light(library: Library, scene: Scene) -> Run:
+    """The same, where a sample of an occupied cell stops half of the light: at most ten a ray."""
+    return _traversal(scene, stop_below=1e-3)
+
+
+def _traversal(scene: Scene, stop_below: float) -> Run:
     device = scene.device
     origins = 3 * torch.nn.functional.normalize(torch.randn(_RAYS, 3, device=device), dim=1)
     directions = torch.nn.functional.normalize(1.6 * torch.rand(_RAYS, 3, device=device) - 0.8 - origins, dim=1)
     nearest, offset = torch.ones(_RAYS, device=device), torch.rand(_RAYS, device=device)
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], device=device)
     occupied = _ball(device)
-    return lambda: traverse(origins, directions, nearest, 4 * nearest + 1, occupied, box, 2 / _SIDE, offset)
+    rays = origins, directions, nearest, 4 * nearest + 1, occupied, box, 2 / _SIDE, offset
+    opacity = 0.5 * occupied.float()
+    return lambda: traverse(*rays, opacity=opacity, stop_below=stop_below)
 
 
 def _composite(library: Library, scene: Scene) -> Run:
@@ -52,6 +63,14 @@ RAYS: tuple[Benchmark, ...] = (
         "occupancy",
         "traverse, 8,192 rays through 128^3 cells, a tenth occupied",
         _occupancy,
+        ("tests/rendra/kernels/test_occupancy.py",),
+        aim_ms=2,
+        is_public=False,
+    ),
+    Benchmark(
+        "occupancy_light",
+        "the same, ending where light does",
+        _light,
         ("tests/rendra/kernels/test_occupancy.py",),
         aim_ms=2,
         is_public=False,

@@ -8,6 +8,7 @@ import torch
 from assertions import assert_close, assert_finite
 from far_device import Far, far  # noqa: F401
 
+from rendra.kernels.composite import compact, visible
 from rendra.kernels.occupancy import (
     Samples,
     cells_of,
@@ -42,9 +43,21 @@ def bundle(num_rays=150):
     return origins[:wanted], directions[:wanted], nearest[:wanted], farthest[:wanted]
 
 
-def specified(rays, occupied, step=STEP, offset=None, growth=0.0, max_samples=None, box=BOX):
+def specified(rays, occupied, step=STEP, offset=None, growth=0.0, max_samples=None, box=BOX, **light):
     offset = torch.zeros_like(rays[2]) if offset is None else offset
-    return Samples(*reference.traverse((*rays, offset), occupied, box, step, growth, max_samples))
+    return Samples(*reference.traverse((*rays, offset), occupied, box, step, growth, max_samples, **light))
+
+
+def lit(every, rays, opacity, stop_below, max_samples=None):
+    """Of all samples of rays those that light reaches, found afterwards."""
+    middles = (every.starts + every.ends) / 2
+    points = rays[0][every.ray_index] + middles[:, None] * rays[1][every.ray_index]
+    alphas = opacity.flatten()[cells_of(points, BOX, tuple(opacity.shape))]
+    seen = visible(alphas, every.ray_first, stop_below)
+    if max_samples is not None:
+        seen &= torch.arange(len(seen)) < every.ray_first[every.ray_index] + max_samples
+    kept, ray_first = compact(seen, every.ray_first)
+    return Samples(ray_first, *(column[kept] for column in every[1:]))
 
 
 def assert_same(first, second):
@@ -152,6 +165,65 @@ def test_only_the_nearest_samples_of_a_ray():
     assert torch.equal(found.ray_first.diff(), every.ray_first.diff().clamp(max=7))
 
 
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 9), (33, 20, 6), (16, 32, 48)])
+@pytest.mark.parametrize("stop_below", [1e-3, 0.3, 1.0])
+def test_rays_end_where_light_does(shape, stop_below):
+    """The samples that are visible among all, to the bit; whole, short and growing steps, many and few samples."""
+    occupied, opacity, rays = torch.rand(shape) < 0.4, torch.rand(shape) ** 4, bundle()
+    opacity[torch.rand(shape) < 0.2] = 0
+    for options in ({}, {"offset": torch.rand(150)}, {"step": 0.004}, {"growth": 0.05}, {"max_samples": 5}):
+        given = {"step": STEP, **options}
+        found = traverse(*rays, occupied, BOX, **given, opacity=opacity, stop_below=stop_below)
+        most = given.pop("max_samples", None)
+        assert_same(found, lit(traverse(*rays, occupied, BOX, **given), rays, opacity, stop_below, most))
+        if not options.get("growth"):
+            assert_same(found, specified(rays, occupied, **options, opacity=opacity, stop_below=stop_below))
+
+
+def test_clear_cells_hide_nothing_and_opaque_ones_all_behind():
+    occupied, rays = torch.rand(9, 12, 10) < 0.5, bundle()
+    every = traverse(*rays, occupied, BOX, STEP)
+    for light in (
+        {"opacity": torch.zeros(9, 12, 10), "stop_below": 1.0},
+        {"opacity": torch.ones(9, 12, 10), "stop_below": 0.0},
+    ):
+        assert_same(traverse(*rays, occupied, BOX, STEP, **light), every)
+        assert_same(specified(rays, occupied, **light), every)
+    light = {"opacity": torch.ones(9, 12, 10), "stop_below": 1e-6}
+    first = traverse(*rays, occupied, BOX, STEP, **light)
+    assert_same(first, specified(rays, occupied, **light))
+    assert torch.equal(first.ray_first.diff(), every.ray_first.diff().clamp(max=1))
+    assert torch.equal(first.starts, every.starts[every.ray_first[:-1][every.ray_first.diff() > 0]])
+
+
+def test_the_sample_that_takes_the_last_light_is_kept():
+    """Half of the light in each sample: 1, 1/2, 1/4 and 1/8 before the first four, exactly."""
+    rays = torch.tensor([[-3.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]), torch.zeros(1), torch.full((1,), math.inf)
+    for stop_below, count in ((1.0, 1), (0.5, 2), (0.125, 4), (0.1251, 3)):
+        light = {"opacity": torch.full((4, 4, 4), 0.5), "stop_below": stop_below}
+        occupied = torch.ones(4, 4, 4, dtype=torch.bool)
+        assert len(traverse(*rays, occupied, BOX, 0.01, **light).starts) == count
+        assert len(specified(rays, occupied, 0.01, **light).starts) == count
+
+
+def test_diverged_opacities_end_rays():
+    rays, occupied = bundle(), torch.ones(3, 3, 3, dtype=torch.bool)
+    light = {"opacity": torch.full((3, 3, 3), math.nan), "stop_below": 0.5}
+    found = traverse(*rays, occupied, BOX, STEP, **light)
+    assert_same(found, specified(rays, occupied, **light))
+    assert found.ray_first.diff().max() == 1
+
+
+def test_light_of_no_rays_and_no_cells():
+    light = {"opacity": torch.rand(3, 3, 3), "stop_below": 0.1}
+    occupied, rays = torch.ones(3, 3, 3, dtype=torch.bool), bundle()
+    for given, cells in (((x[:0] for x in rays), occupied), (rays, ~occupied)):
+        given = tuple(given)
+        found = traverse(*given, cells, BOX, STEP, **light)
+        assert_same(found, specified(given, cells, **light))
+        assert not len(found.starts)
+
+
 def test_float64_far_devices_and_strides(far):  # noqa: F811
     occupied, rays = torch.rand(6, 5, 4) < 0.5, bundle(30)
     expected = traverse(*rays, occupied, BOX, STEP)
@@ -163,13 +235,22 @@ def test_float64_far_devices_and_strides(far):  # noqa: F811
     assert_same([x.cpu() for x in there], expected)
     turned = occupied.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     assert_same(traverse(rays[0].T.contiguous().T, *rays[1:], turned, BOX, STEP), expected)
+    thin = torch.rand(4, 5, 6).permute(2, 1, 0)
+    light = {"opacity": thin, "stop_below": 0.2}
+    expected = traverse(*rays, occupied, BOX, STEP, **light)
+    assert_same(traverse(*rays, occupied, BOX, STEP, opacity=thin.contiguous(), stop_below=0.2), expected)
+    light["opacity"] = thin.to(far)
+    assert_same([x.cpu() for x in traverse(*(x.to(far) for x in rays), occupied.to(far), BOX.to(far), STEP, **light)],
+                expected)  # fmt: skip
 
 
 def test_results_do_not_depend_on_threads():
     occupied, rays, threads, results = torch.rand(30, 30, 30) < 0.1, bundle(500), torch.get_num_threads(), []
+    opacity = torch.rand(30, 30, 30)
     for number in (1, 2, 3):
         torch.set_num_threads(number)
-        results.append(traverse(*rays, occupied, BOX, STEP))
+        every = traverse(*rays, occupied, BOX, STEP)
+        results.append([*every, *traverse(*rays, occupied, BOX, STEP, opacity=opacity, stop_below=0.01)])
     torch.set_num_threads(threads)
     assert_same(results[0], results[1])
     assert_same(results[0], results[2])
@@ -232,6 +313,12 @@ def test_bad_input_is_named():
         ({"offset": torch.zeros(4)}, "offset must be"),
         ({"farthest": torch.zeros(5).double()}, "farthest must be"),
         ({"origins": torch.zeros(5, 2)}, "origins must be floats"),
+        ({"stop_below": 0.1}, "stop_below=0.1 needs the opacity"),
+        ({"opacity": torch.zeros(2, 2, 2), "stop_below": 1.5}, r"stop_below must be a transmittance in \[0, 1\]"),
+        ({"opacity": torch.zeros(2, 2, 2), "stop_below": math.nan}, "stop_below must be"),
+        ({"opacity": torch.zeros(2, 2, 2).double()}, "opacity must be torch.float32"),
+        ({"opacity": torch.zeros(2, 2)}, "opacity must be torch.float32 of shape"),
+        ({"opacity": torch.zeros(2, 2, 3)}, r"opacity must have the shape of occupied, \(2, 2, 2\)"),
     ):
         names = dict(zip(("origins", "directions", "nearest", "farthest"), rays, strict=True))
         with pytest.raises(ValueError, match=message):
@@ -243,7 +330,8 @@ def test_bad_input_is_named():
 
 def test_the_operator_is_well_registered():
     arguments = *bundle(8), torch.zeros(8), torch.rand(4, 4, 4) < 0.5, BOX, STEP, 0.0, None
-    torch.library.opcheck(torch.ops.rendra.traverse.default, arguments)
+    for light in ((None, 0.0), (torch.rand(4, 4, 4), 0.1)):
+        torch.library.opcheck(torch.ops.rendra.traverse.default, (*arguments, *light))
 
 
 @pytest.mark.gpu

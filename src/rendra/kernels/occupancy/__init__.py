@@ -44,13 +44,16 @@ def traverse(
     offset: Tensor | None = None,
     growth: float = 0.0,
     max_samples: int | None = None,
+    opacity: Tensor | None = None,
+    stop_below: float = 0.0,
 ) -> Samples:
     """The samples of rays whose middles lie in occupied cells; `reference.py` states each rule.
 
     Sample k of a ray begins at t_k = nearest + (offset + k) step and ends at t_{k+1}, the last one at `farthest`.
     With growth > 0 that holds up to the distance step / growth, and beyond it t_{k+1} = (1 + growth) t_k: samples as
     long as max(step, growth t). Empty cells are crossed cell by cell, and empty blocks at once, without asking their
-    samples; the result is the same as if all were asked. Not differentiable; the same on any number of threads.
+    samples; the result is the same as if all were asked. Where it is known how opaque cells are, rays end where light
+    does. Not differentiable; the same on any number of threads.
 
     Args:
         origins: (R, 3) where rays begin.
@@ -63,10 +66,13 @@ def traverse(
         offset: (R,) shift of each ray's samples in steps, in [0, 1): uniform noise in training; None is 0.
         growth: of samples with the distance, in [0, 1]: 1/256 for a scene without end; 0 leaves them equally long.
         max_samples: most samples of one ray, the nearest stay; None is all.
+        opacity: (D, H, W) in [0, 1], of a sample in each cell; not checked to lie there.
+        stop_below: in [0, 1]: a ray ends where the product of (1 - opacity) over its samples falls below it: these
+            are the samples that `rendra.kernels.composite.visible` sees of all. 0 lets light reach everything.
 
     Raises:
-        ValueError: a shape, type, device or number that cannot be; a step so short that there are more than 2^28
-            samples.
+        ValueError: a shape, type, device or number that cannot be; stop_below without opacity; a step so
+            short that there are more than 2^28 samples.
     """
     _check_rays(origins, directions, {"nearest": nearest, "farthest": farthest, "offset": offset})
     _check_grid("occupied", occupied, torch.bool, origins.device)
@@ -75,11 +81,16 @@ def traverse(
         raise ValueError(f"step must be positive and finite and growth in [0, 1], got {step} and {growth}")
     if max_samples is not None and max_samples < 1:
         raise ValueError(f"max_samples must be at least 1, or None for all, got {max_samples}")
+    _check_light(opacity, stop_below, occupied, origins)
+    opacity = None if opacity is None or not stop_below else opacity.detach()
     offset = torch.zeros_like(nearest) if offset is None else offset
     rays = origins.detach(), directions.detach(), nearest.detach(), farthest.detach(), offset.detach()
     if origins.device.type != "cpu" or origins.dtype != torch.float32:
-        return Samples(*reference.traverse(rays, occupied, box.detach(), step, growth, max_samples))
-    return Samples(*_traverse_on_cpu(*rays, occupied, box.detach(), float(step), float(growth), max_samples))
+        return Samples(
+            *reference.traverse(rays, occupied, box.detach(), step, growth, max_samples, opacity, stop_below)
+        )
+    settings = float(step), float(growth), max_samples, opacity, float(stop_below)
+    return Samples(*_traverse_on_cpu(*rays, occupied, box.detach(), *settings))
 
 
 def cells_of(points: Tensor, box: Tensor, size: tuple[int, int, int]) -> Tensor:
@@ -186,6 +197,20 @@ def _check_grid(name: str, grid: Tensor, dtype: torch.dtype, device: torch.devic
         )
 
 
+def _check_light(opacity: Tensor | None, stop_below: float, occupied: Tensor, origins: Tensor) -> None:
+    if not 0 <= stop_below <= 1:
+        raise ValueError(f"stop_below must be a transmittance in [0, 1], got {stop_below}")
+    if opacity is None:
+        if stop_below > 0:
+            raise ValueError(f"stop_below={stop_below} needs the opacity of the cells, got None")
+        return
+    _check_grid("opacity", opacity, origins.dtype, origins.device)
+    if opacity.shape != occupied.shape:
+        raise ValueError(
+            f"opacity must have the shape of occupied, {tuple(occupied.shape)}, got {tuple(opacity.shape)}"
+        )
+
+
 def _check_box(box: Tensor, points: Tensor) -> None:
     if box.shape != (2, 3) or box.dtype != points.dtype or box.device != points.device:
         raise ValueError(
@@ -209,6 +234,8 @@ def _traverse_on_cpu(
     step: float,
     growth: float,
     max_samples: int | None,
+    opacity: Tensor | None,
+    stop_below: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     rays = (
         origins.contiguous().numpy(), directions.contiguous().numpy(), nearest.contiguous().numpy(),
@@ -216,13 +243,14 @@ def _traverse_on_cpu(
     )  # fmt: skip
     most = numba_cpu.LATTICE_END if max_samples is None else max_samples
     cells, corners = occupied.contiguous().numpy(), box.contiguous().numpy()
-    results = numba_cpu.forward(rays, cells, corners, step, growth, most)
+    opacities = None if opacity is None else opacity.contiguous().numpy()
+    results = numba_cpu.forward(rays, cells, corners, step, growth, most, opacities, stop_below)
     ray_first, starts, ends, ray_index = map(torch.from_numpy, results)
     return ray_first, starts, ends, ray_index
 
 
 @_traverse_on_cpu.register_fake
-def _(origins, directions, nearest, farthest, offset, occupied, box, step, growth, max_samples):  # type: ignore[no-untyped-def]
+def _(origins, directions, nearest, farthest, offset, occupied, box, *settings):  # type: ignore[no-untyped-def]
     total = torch.library.get_ctx().new_dynamic_size()
     ray_first = origins.new_empty((len(origins) + 1,), dtype=torch.int64)
     starts = origins.new_empty((total,))

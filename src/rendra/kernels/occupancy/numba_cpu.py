@@ -4,7 +4,8 @@ Rounding is monotone: along a ray the cell of a sample's middle never turns back
 or in one block of cells, all samples between them do; a jump over an empty block is checked at its two ends, and the
 result is that of asking every sample. Blocks of 4^3 and 16^3 cells without an occupied one are crossed at once. Where
 a jump must end is computed with a bound on its rounding error, and asked only if that leaves two answers. Runs of
-samples are noted while a ray is walked, and filled in when their number is known.
+samples are noted while a ray is walked, and filled in when their number is known. Transmittance is carried in
+float64, sample by sample, as `composite` does.
 """
 
 import math
@@ -22,6 +23,7 @@ _RUNS = 32  # of samples, noted for each ray; if one has more, rays are walked a
 _LEAST = np.float32(1e-30)  # a slope below it is none, where a guess will do
 _STEPS = np.float32(LATTICE_END)
 _ROUNDING = np.float32(2.0**-20)  # sixteen roundings: more than there are between a ray and the cell of a sample
+_CLEAR = np.zeros((1, 1, 1), np.float32)
 
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -29,7 +31,14 @@ Rays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def forward(
-    rays: Rays, occupied: np.ndarray, box: np.ndarray, step: float, growth: float, max_samples: int
+    rays: Rays,
+    occupied: np.ndarray,
+    box: np.ndarray,
+    step: float,
+    growth: float,
+    max_samples: int,
+    opacity: np.ndarray | None,
+    stop_below: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """First sample of each ray (R + 1,), and starts, ends and ray (M,) of the samples.
 
@@ -41,12 +50,13 @@ def forward(
     scale = size.astype(np.float32) / (box[1] - box[0])
     grid = (*box[0], *scale, *size.astype(np.float32))
     pace = _pace(step, growth)
+    light = (_CLEAR, 0.0) if opacity is None else (opacity, stop_below)
     workers, num_rays = num_threads(), len(rays[0])
     num_runs, ray_first = np.zeros(num_rays, np.int64), np.zeros(num_rays + 1, np.int64)
     noted = 0 if bounds[0] > bounds[1] else _RUNS  # nothing to walk to in an empty grid
     runs = np.empty((num_rays, 2 * noted), np.int32)
     while noted:
-        _walk_all(rays, pace, grid, *levels, bounds, max_samples, workers, runs, num_runs, ray_first[1:])
+        _walk_all(rays, pace, grid, *levels, bounds, max_samples, light, workers, runs, num_runs, ray_first[1:])
         noted = int(num_runs.max(initial=0))
         if 2 * noted <= runs.shape[1]:
             break
@@ -256,7 +266,17 @@ def _size_of_lattice(lattice, pace):
 
 
 @scalar_kernel
-def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, runs):
+def _dimmed(first, last, alpha, clear, stop):
+    """The end of the samples from `first` to `last` of one cell that light reaches, and what is left behind them."""
+    past = 1.0 - np.float64(alpha)
+    while first < last and clear >= stop:
+        clear *= past
+        first += 1
+    return first, clear
+
+
+@scalar_kernel
+def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, light, r, runs):
     """Note runs [begin, end) of samples in `runs`, as many as it holds: the number of samples, and of runs."""
     total = _size_of_lattice(lattice, pace)
     if total == 0:
@@ -269,7 +289,7 @@ def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, run
     ahead_x, ahead_y, ahead_z = np.int64(dx > ZERO), np.int64(dy > ZERO), np.int64(dz > ZERO)
     end_of_lattice, blur = np.float32(total), _ROUNDING * abs(lattice[0])
     k, cell = _entry(ray, lattice, pace, grid, bounds, total)
-    count, num_runs, last = 0, 0, -1
+    count, num_runs, last, (opacity, stop), clear = 0, 0, -1, light, 1.0
     while k < total and count < most and _is_inside(cell, bounds):
         x, y, z = cell
         is_occupied, shift = False, 0
@@ -292,6 +312,8 @@ def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, run
             beyond = _search(k, cell, shift, beyond, ray, lattice, pace, grid, total)
         if is_occupied:
             end = min(beyond, k + most - count)
+            if stop > 0.0:
+                end, clear = _dimmed(k, end, opacity[z, y, x], clear, stop)
             count += end - k
             if k != last:
                 num_runs += 1
@@ -300,6 +322,8 @@ def _walk(ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, run
             if 2 * num_runs <= runs.shape[1]:
                 runs[r, 2 * num_runs - 1] = end
             last = beyond
+            if not clear >= stop:
+                break
         k, cell = beyond, _cells(beyond, ray, lattice, pace, grid)
     return count, num_runs
 
@@ -319,7 +343,7 @@ def _ray_of(rays, r, pace):
 
 
 @parallel_kernel
-def _walk_all(rays, pace, grid, cells, blocks, regions, bounds, most, workers, runs, num_runs, counts):
+def _walk_all(rays, pace, grid, cells, blocks, regions, bounds, most, light, workers, runs, num_runs, counts):
     num_rays = len(num_runs)
     for worker in prange(workers):
         for block in range(worker, (num_rays + _RAYS_AT_ONCE - 1) // _RAYS_AT_ONCE, workers):
@@ -327,7 +351,7 @@ def _walk_all(rays, pace, grid, cells, blocks, regions, bounds, most, workers, r
                 ray, lattice, is_ray = _ray_of(rays, r, pace)
                 if is_ray:
                     counts[r], num_runs[r] = _walk(
-                        ray, lattice, pace, grid, cells, blocks, regions, bounds, most, r, runs
+                        ray, lattice, pace, grid, cells, blocks, regions, bounds, most, light, r, runs
                     )
 
 

@@ -13,6 +13,8 @@ which they begin. Without growth there is no knee. The rules:
    the box lie outside.
 3. A ray has none if nearest < farthest fails, its direction is zero, or any number but `farthest` is not finite.
 4. Of a ray's samples the first `max_samples` are kept.
+5. With stop_below > 0 a sample is kept only if the product of 1 - opacity[its cell], in float64, over the samples
+   kept before it on its ray is at least `stop_below`: before the first it is 1.
 All samples are asked, up to the distance behind which no point of the box can lie, some at a time.
 """
 
@@ -30,25 +32,36 @@ Rays = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def traverse(
-    rays: Rays, occupied: Tensor, box: Tensor, step: float, growth: float, max_samples: int | None
+    rays: Rays,
+    occupied: Tensor,
+    box: Tensor,
+    step: float,
+    growth: float,
+    max_samples: int | None,
+    opacity: Tensor | None = None,
+    stop_below: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First sample of each ray (R + 1,), and starts, ends and ray (M,) of the samples."""
     origins, directions, nearest, farthest, offset = rays
     sizes = _lattice_sizes(rays, box, step, growth)
-    longest = int(sizes.max()) if len(sizes) else 0
-    parts = [(nearest[:0], nearest[:0], sizes[:0])]
+    longest = max(sizes.tolist(), default=0)
+    opacity = nearest.new_zeros(occupied.shape) if opacity is None else opacity
+    parts = [(nearest[:0], nearest[:0], sizes[:0], opacity.flatten()[:0])]
     rows = max(1, _SAMPLES_AT_ONCE // max(1, longest))
     for some in torch.arange(len(origins), device=origins.device).split(rows):
         here = origins[some], directions[some], nearest[some], farthest[some], offset[some]
-        for first in range(0, int(sizes[some].max()), _SAMPLES_AT_ONCE):
+        for first in range(0, max(sizes[some].tolist(), default=0), _SAMPLES_AT_ONCE):
             k = torch.arange(first, min(first + _SAMPLES_AT_ONCE, longest), device=origins.device)
-            starts, ends, kept = _samples(here, k, occupied, box, step, growth)
+            starts, ends, kept, (x, y, z) = _samples(here, k, occupied, box, step, growth)
             kept &= k < sizes[some, None]
-            parts.append((starts[kept], ends[kept], some[:, None].expand_as(kept)[kept]))
-    starts, ends, index = (torch.cat(column) for column in zip(*parts, strict=True))
+            alphas = opacity[z[kept], y[kept], x[kept]]
+            parts.append((starts[kept], ends[kept], some[:, None].expand_as(kept)[kept], alphas))
+    starts, ends, index, alphas = (torch.cat(column) for column in zip(*parts, strict=True))
+    rank = torch.arange(len(index), device=index.device) - _firsts(index, len(origins))[index]
+    kept = _is_lit(alphas, index, rank, stop_below) if stop_below > 0 else torch.ones_like(rank, dtype=torch.bool)
     if max_samples is not None:
-        kept = torch.arange(len(index), device=index.device) < _firsts(index, len(origins))[index] + max_samples
-        starts, ends, index = starts[kept], ends[kept], index[kept]
+        kept &= rank < max_samples
+    starts, ends, index = starts[kept], ends[kept], index[kept]
     return _firsts(index, len(origins)), starts, ends, index
 
 
@@ -66,8 +79,8 @@ def _lattice_sizes(rays: Rays, box: Tensor, step: float, growth: float) -> Tenso
 
 def _samples(
     rays: Rays, k: Tensor, occupied: Tensor, box: Tensor, step: float, growth: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Starts, ends (R, K) of samples k of some rays, and which are kept."""
+) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+    """Starts, ends (R, K) of samples k of some rays, which lie in occupied cells, and those cells' x, y, z."""
     origins, directions, nearest, farthest, offset = rays
     base, pace = _place(nearest, step, growth)[:, None], nearest.new_tensor(step)
     edges = torch.stack((k, k + 1)).to(nearest.dtype)[:, None]
@@ -80,7 +93,21 @@ def _samples(
     places = ((origins[:, None] + middles * directions[:, None] - box[0]) * scale).floor()
     inside = ((places >= 0) & (places < size)).all(-1)
     x, y, z = torch.where(inside[..., None], places, 0.0).to(torch.int64).unbind(-1)
-    return starts, ends, exists & inside & occupied[z, y, x]
+    return starts, ends, exists & inside & occupied[z, y, x], (x, y, z)
+
+
+def _is_lit(alphas: Tensor, index: Tensor, rank: Tensor, stop_below: float) -> Tensor:
+    """Whether light reaches each sample (M,), the one with that rank on the ray with that index."""
+    lit = torch.empty_like(index, dtype=torch.bool)
+    longest = int(rank.max()) + 1 if len(rank) else 1
+    rows = max(1, _SAMPLES_AT_ONCE // longest)
+    for first in range(0, int(index.max()) + 1 if len(index) else 0, rows):
+        here = (index >= first) & (index < first + rows)
+        spread = alphas.new_zeros((rows, longest), dtype=torch.float64)
+        spread[index[here] - first, rank[here]] = alphas[here].double()
+        before = torch.cat((torch.ones_like(spread[:, :1]), (1 - spread).cumprod(1)[:, :-1]), dim=1)
+        lit[here] = before[index[here] - first, rank[here]] >= stop_below
+    return lit
 
 
 def _distance(place: Tensor, step: float, growth: float) -> Tensor:

@@ -141,34 +141,27 @@ class OccupancyRenderer(RayRenderer):
             self.field.box,
             self.step_length,
             offset,
+            opacity=self.usual,
+            stop_below=self.stop_below,
         )
-        points, middles, lengths = self._points(rays, samples.starts, samples.ends, samples.ray_index)
-        with torch.no_grad():
-            lit = visible(self._usual_at(points), samples.ray_first, self.stop_below)
-        kept, ray_first = compact(lit, samples.ray_first)
+        ray_first, ray_index = samples.ray_first, samples.ray_index
+        points, middles, lengths = self._points(rays, samples.starts, samples.ends, ray_index)
         if self.looks_first:
             with torch.no_grad():
-                opacities = self.field.opacity(points.index_select(0, kept), lengths.index_select(0, kept))
-            seen, ray_first = compact(visible(opacities, ray_first, self.stop_below), ray_first)
-            kept = kept.index_select(0, seen)
-        ray_index = samples.ray_index.index_select(0, kept)
-        points, middles, lengths = (values.index_select(0, kept) for values in (points, middles, lengths))
+                opacities = self.field.opacity(points, lengths)
+            kept, ray_first = compact(visible(opacities, ray_first, self.stop_below), ray_first)
+            points, middles, lengths, ray_index = (
+                values.index_select(0, kept) for values in (points, middles, lengths, ray_index)
+            )
         alphas, rgb = self.field(points, rays.directions, lengths, ray_index)
         light = composite_alphas(alphas, rgb, middles, ray_first)
         return RaysSeen(light.features, light.opacity, light.depth)
 
     def looks_at(self, points: Tensor) -> Tensor:
         """Whether points (M, 3) lie in cells that are not empty: (M,) bool."""
-        cell = self._cells_of(points)
-        return self.occupied.flatten().index_select(0, cell.clamp_min(0)) & (cell >= 0)
-
-    def _usual_at(self, points: Tensor) -> Tensor:
-        """The usual opacity of samples at points (M, 3): (M,)."""
-        return self.usual.flatten().index_select(0, self._cells_of(points).clamp_min(0))
-
-    def _cells_of(self, points: Tensor) -> Tensor:
         depth, height, width = self.occupied.shape
-        return cells_of(points, self.field.box, (depth, height, width))
+        cell = cells_of(points, self.field.box, (depth, height, width))
+        return self.occupied.flatten().index_select(0, cell.clamp_min(0)) & (cell >= 0)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""
