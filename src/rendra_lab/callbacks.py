@@ -57,31 +57,6 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-class LastStepKeeper(Callback):
-    """Saves the state after the last step of a fit, be it finished, broken or interrupted.
-
-    Args:
-        path: of the checkpoint.
-    """
-
-    def __init__(self, path: str) -> None:
-        self.path = path
-        self._begun_at = 0
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Notes where the fit begins."""
-        self._begun_at = trainer.global_step
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Saves the end."""
-        trainer.save_checkpoint(self.path)
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves what an ended fit has reached, if it made a step; alone, as other processes may be gone."""
-        if trainer.world_size == 1 and trainer.training and trainer.global_step > self._begun_at:
-            trainer.save_checkpoint(self.path)
-
-
 class ImageLogger(Callback):
     """Writes the panels of a fit, side by side, as PNG files and to TensorBoard.
 

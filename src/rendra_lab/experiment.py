@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -20,12 +19,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer, seed_everything
-from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.utilities.exceptions import SIGTERMException
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.model_helpers import is_overridden
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from rendra_lab import report
+from rendra_lab import interruptions, report, signals
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import StepTimer
 from rendra_lab.checkpoints import (
@@ -96,7 +95,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
         settings = {
             "logger": _parts(cfg.logger) or False,
             "callbacks": callbacks,
-            "enable_checkpointing": any(isinstance(callback, ModelCheckpoint) for callback in callbacks),
+            "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
             "enable_progress_bar": any(_is_progress(callback) for callback in callbacks),
         }
     return Experiment(cfg, task, data, instantiate(cfg.trainer, _convert_="all", **settings))
@@ -107,38 +106,58 @@ def run(cfg: DictConfig) -> float | None:
 
     Returns the value of `optimized_metric`, or None where none is named. A failed run leaves its traceback in
     the log file and a `metrics.json` with `status: failed`, and raises. One that is interrupted (Ctrl-C, SIGTERM)
-    keeps its last step, and ends the program with code 130 or 143.
+    keeps its last step, and ends the program with code 130 or 143; SIGUSR1 with 138, see `interruptions`.
     """
+    with signals.listening():
+        return _run(cfg)
+
+
+def _run(cfg: DictConfig) -> float | None:
     clock = _Clock()
     folder = Path(cfg.run_dir)
     record = _opening_record(cfg)
+    experiment = None
     try:
         experiment = build(cfg)
-        checkpoint = whole(find_checkpoint(cfg.ckpt_path, folder, Path(cfg.output_root)))
+        wanted = cfg.ckpt_path or interruptions.requeued_from(Path(cfg.output_root), record["overrides"])
+        checkpoint = whole(find_checkpoint(wanted, folder, Path(cfg.output_root)))
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
         with _own_processes(experiment):
             record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
     except BaseException as error:
-        code = _interruption(error)
-        log.info("the run ended early", exc_info=code is None)  # the console gets the message alone
-        record.update(
-            status="failed" if code is None else "interrupted",
-            error=f"{type(error).__name__}: {error}"[:2000],
-            seconds=clock.laps(),
-        )
-        if _is_first_process():
-            report.write_json(folder / "metrics.json", record)
-        if code is None:
-            raise
-        place = report.short_path(folder)
-        sys.stderr.write(f"interrupted; what it reached is in {place}, go on with ckpt_path={place}\n")
-        raise SystemExit(code) from None
+        record["steps"] = 0 if experiment is None else experiment.trainer.global_step
+        with signals.patient(for_all=True):
+            _conclude_early(cfg, record, clock, error)
+        raise
     record.update(status="ok", steps=experiment.trainer.global_step, seconds=clock.laps())
     record.update(_measurements(experiment))
-    if experiment.trainer.is_global_zero:
-        _conclude(experiment, record)
+    with signals.patient(for_all=True):
+        if experiment.trainer.is_global_zero:
+            _conclude(experiment, record)
+    if number := signals.waiting():  # this run is whole; what would follow it is not wanted
+        raise SystemExit(128 + number)
     return _optimized(record)
+
+
+def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, error: BaseException) -> None:
+    """Writes down why a run ended; SystemExit where a signal ended it."""
+    number = interruptions.signal_of(error)
+    log.info("the run ended early", exc_info=number is None)  # the console gets the message alone
+    record.update(
+        status="failed" if number is None else "interrupted",
+        error=f"{type(error).__name__}: {error}"[:2000],
+        seconds=clock.laps(),
+    )
+    folder = Path(cfg.run_dir)
+    if _is_first_process():
+        report.write_json(folder / "metrics.json", record)
+    if number is None:
+        return
+    if _is_first_process():
+        line = interruptions.farewell(number, folder, record["steps"], Path(cfg.output_root), record["overrides"])
+        sys.stderr.write(f"{line}\n")
+    raise SystemExit(128 + number) from None
 
 
 def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, Any] | None = None) -> Experiment:
@@ -177,14 +196,6 @@ def evaluate(experiment: Experiment) -> dict[str, float]:
         raise UserError(f"{type(experiment.data).__name__} has no test data")
     experiment.trainer.test(experiment.task, datamodule=experiment.data, verbose=False)
     return _numbers(experiment.trainer)
-
-
-def _interruption(error: BaseException) -> int | None:
-    """The exit code of a program that a signal ended, as shells count it; None for any other error."""
-    if isinstance(error, SIGTERMException):
-        return 128 + signal.SIGTERM
-    stopped = isinstance(error, KeyboardInterrupt) or isinstance(error.__context__, KeyboardInterrupt)
-    return 128 + signal.SIGINT if stopped else None
 
 
 class _Clock:
@@ -366,7 +377,7 @@ def _is_progress(callback: Any) -> bool:
 
 
 def _is_first_process() -> bool:
-    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+    return rank_zero_only.rank == 0
 
 
 def _seed(cfg: DictConfig) -> int:

@@ -19,6 +19,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rendra_lab import signals
 from rendra_lab.errors import UserError
 from rendra_lab.sweep import conclude_sweep
 
@@ -46,9 +47,14 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands its exceptions over instead of printing them
     FailureKeeper.active = True
     try:
-        main()
+        with signals.listening():
+            main()
         if FailureKeeper.failure is not None:
             raise FailureKeeper.failure
+    except signals.Interrupted as stop:  # before the run, or between the runs of a sweep
+        conclude_sweep()
+        sys.stderr.write(f"{Path(script).name}: {stop}\n")
+        sys.exit(stop.code)
     except BrokenPipeError:  # the reader of the output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_EXIT_FAILURE)

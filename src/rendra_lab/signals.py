@@ -1,0 +1,116 @@
+"""Signals that end a program: SIGINT (Ctrl-C), SIGTERM and SIGUSR1 become one exception, raised where it harms nothing.
+
+Imported before anything else runs: stays light.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+WATCHED = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name))
+
+_OURS_TO_TAKE = (signal.SIG_DFL, signal.default_int_handler)
+_SECOND_THOUGHT_S = 0.3  # terminals, srun and torchrun deliver one wish twice, at once
+
+
+class Interrupted(BaseException):
+    """A signal asked the program to end. No `Exception`: nothing on the way may take it for a failure.
+
+    Args:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"interrupted by {signal.Signals(number).name}")
+        self.number = number
+
+    @property
+    def code(self) -> int:
+        """The exit code, as shells count it: 130 for SIGINT, 143 for SIGTERM, 138 for SIGUSR1."""
+        return 128 + self.number
+
+
+class _Watch:
+    """The state of the one watch of a process."""
+
+    def __init__(self) -> None:
+        self.before: dict[int, Any] = {}
+        self.owner = 0
+        self.patience = 0
+        self.caught: int | None = None
+        self.caught_at = 0.0
+
+    def handle(self, number: int, _: FrameType | None) -> None:
+        if os.getpid() != self.owner:  # a forked worker, whose parent decides
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        first, now = self.caught is None, time.monotonic()
+        insists = not first and number == signal.SIGINT and now - self.caught_at > _SECOND_THOUGHT_S
+        if first:
+            self.caught, self.caught_at = number, now
+        if self.patience == 0 or (insists and self.patience == 1):
+            raise Interrupted(self.caught or number)
+        if first and number == signal.SIGINT and os.environ.get("LOCAL_RANK", "0") == "0":
+            sys.stderr.write("stopping after this step; Ctrl-C once more to stop at once\n")
+
+
+_watch = _Watch()
+
+
+@contextlib.contextmanager
+def listening() -> Iterator[None]:
+    """Signals raise `Interrupted` meanwhile; within another such block, or outside the main thread, nothing changes.
+
+    A signal that somebody else handles already, such as submitit, stays theirs.
+    """
+    if _watch.patience == 0:
+        _watch.caught = None
+    if _watch.before or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _watch.owner, _watch.patience = os.getpid(), 0
+    found = {number: signal.getsignal(number) for number in WATCHED}
+    _watch.before = {number: handler for number, handler in found.items() if handler in _OURS_TO_TAKE}
+    take_over()
+    try:
+        yield
+    finally:
+        for number, handler in _watch.before.items():
+            signal.signal(number, handler)
+        _watch.before = {}
+
+
+def take_over() -> None:
+    """Puts the handlers of this watch back in place, where a library has laid its own over them."""
+    if threading.current_thread() is threading.main_thread():
+        for number in _watch.before:
+            signal.signal(number, _watch.handle)
+
+
+@contextlib.contextmanager
+def patient(for_all: bool = False) -> Iterator[None]:
+    """Signals wait meanwhile, for who asks `waiting`; a second Ctrl-C does not.
+
+    Args:
+        for_all: a second Ctrl-C waits too: for what must not be torn, such as a file that is written.
+    """
+    weight = 2 if for_all else 1
+    _watch.patience += weight
+    try:
+        yield
+    finally:
+        _watch.patience -= weight
+
+
+def waiting() -> int | None:
+    """The number of the signal that has come, if any."""
+    return _watch.caught
