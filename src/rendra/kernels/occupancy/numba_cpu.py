@@ -195,6 +195,18 @@ def _sample_at(distance, lattice, pace):
 
 
 @scalar_kernel
+def _narrowed(low, high, probe, is_low, turn):
+    """One step of a search between two numbers: the neighbour of a guess is asked next, and halves after three."""
+    if is_low:
+        low, probe = probe, probe + 1
+    else:
+        high, probe = probe, probe - 1
+    if turn > 1:
+        probe = (low + high) // 2
+    return low, high, min(max(probe, low + 1), high - 1), turn + 1
+
+
+@scalar_kernel
 def _entry(ray, lattice, pace, grid, bounds, total):
     """The first of all samples that is not before the bounds; and its cell."""
     ox, oy, oz, dx, dy, dz = ray
@@ -207,18 +219,11 @@ def _entry(ray, lattice, pace, grid, bounds, total):
     distance = max(_entry_along(oy, dy, ly, sy, bounds[2], bounds[3]), distance)
     distance = max(_entry_along(oz, dz, lz, sz, bounds[4], bounds[5]), distance)
     guess = np.ceil(_sample_at(distance, lattice, pace))
-    probe, turn = np.int64(min(max(guess, ZERO), np.float32(total))), 0
+    probe, turn = np.int64(min(max(guess, ONE), np.float32(total - 1))), 0
     while high - low > 1:
-        probe = min(max(probe, low + 1), high - 1)
-        here = _cells(probe, ray, lattice, pace, grid)
-        if _is_before(here, ray, bounds):
-            low, probe = probe, probe + 1
-        else:
-            high, cell, probe = probe, here, probe - 1
-        turn += 1
-        if turn > 2:
-            probe = (low + high) // 2
-    return high, cell
+        is_before = _is_before(_cells(probe, ray, lattice, pace, grid), ray, bounds)
+        low, high, probe, turn = _narrowed(low, high, probe, is_before, turn)
+    return high, _cells(high, ray, lattice, pace, grid)
 
 
 @scalar_kernel
@@ -231,18 +236,11 @@ def _entry_along(origin, direction, low, scale, first, last):
 @scalar_kernel
 def _search(k, cell, shift, probe, ray, lattice, pace, grid, total):
     """The first sample after k that is in another block of 2^shift cells a side, by asking: first at a guess."""
-    low, high, turn = k, total, 0
+    low, high, probe, turn = k, total, min(probe, total - 1), 0
     x, y, z = cell
     while high - low > 1:
-        probe = min(max(probe, low + 1), high - 1)
         i, j, l = _cells(probe, ray, lattice, pace, grid)
-        if ((x ^ i) | (y ^ j) | (z ^ l)) >> shift == 0:
-            low, probe = probe, probe + 1
-        else:
-            high, probe = probe, probe - 1
-        turn += 1
-        if turn > 2:
-            probe = (low + high) // 2
+        low, high, probe, turn = _narrowed(low, high, probe, ((x ^ i) | (y ^ j) | (z ^ l)) >> shift == 0, turn)
     return high
 
 
@@ -252,16 +250,9 @@ def _size_of_lattice(lattice, pace):
     base, offset, farthest = lattice
     guess = np.ceil((_place(farthest, pace) - base) * pace[1] - offset)
     low, high = -1, LATTICE_END
-    probe, turn = np.int64(min(max(guess, ZERO), _STEPS)), 0
+    probe, turn = np.int64(min(max(guess, ZERO), _STEPS - ONE)), 0
     while high - low > 1:
-        probe = min(max(probe, low + 1), high - 1)
-        if _start(probe, lattice, pace) < farthest:
-            low, probe = probe, probe + 1
-        else:
-            high, probe = probe, probe - 1
-        turn += 1
-        if turn > 2:
-            probe = (low + high) // 2
+        low, high, probe, turn = _narrowed(low, high, probe, _start(probe, lattice, pace) < farthest, turn)
     return high
 
 
