@@ -121,7 +121,7 @@ def convert(
     """
     source, target, options = Path(source), Path(target), options or Conversion()
     _demand_free(source, target, options)
-    data = _read(source, options)
+    data = read_geometry(source, options.textures)
     if isinstance(data, Meshes) and (options.sample is not None or options.vertices or not _holds_meshes(target)):
         data = _as_cloud(data, options)
     elif isinstance(data, Pointclouds) and options.sample is not None:
@@ -165,11 +165,23 @@ def _demand_new(path: Path, options: Conversion) -> None:
         raise FileExistsError(f"{path} exists")
 
 
-def _read(source: Path, options: Conversion) -> Meshes | Pointclouds:
-    """A mesh, or a cloud where there are no faces."""
+def read_geometry(source: Path, textures: bool = True) -> Meshes | Pointclouds:
+    """Read a file into a batch of one as it is meant to look: normals and the colours of all materials included.
+
+    Args:
+        source: its suffix chooses the format.
+        textures: read colours and images.
+
+    Returns:
+        A mesh, or a cloud where there are no faces.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: no format has its suffix, or it is malformed (MeshFormatError).
+    """
     if source.suffix.lower() != ".obj":
-        return IO().load_geometry(source, options.textures)
-    mesh = _read_obj(source, options.textures)
+        return IO().load_geometry(source, textures)
+    mesh = _read_obj(source, textures)
     return cloud_of_verts(mesh) if mesh.isempty() else mesh
 
 

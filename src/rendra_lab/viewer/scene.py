@@ -1,0 +1,259 @@
+"""From meshes, clouds and cameras to what the viewer's program reads.
+
+Letters: V verts, F faces, P points, T texture coordinates, N cameras.
+"""
+
+import os
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rendra.io._carried_colors import atlas_as_image, colors_at_verts
+from rendra.io.conversion import read_geometry
+from rendra.renderer.cameras import CamerasBase
+from rendra.renderer.mesh.textures import TexturesAtlas, TexturesUV, TexturesVertex
+from rendra.structures import Meshes, Pointclouds
+from rendra_lab.viewer.packing import (
+    packed_array,
+    packed_colors,
+    packed_image,
+    packed_indices,
+    packed_normals,
+    packed_positions,
+)
+from rendra_lab.viewer.thinning import chosen_points, merged_neighbours
+
+Shape = str | os.PathLike[str] | Meshes | Pointclouds | CamerasBase
+_FRUSTUM_OF_SCENE = 0.06  # depth of a camera's pyramid, in diagonals of what there is beside cameras
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a page takes.
+
+    Attributes:
+        faces: of one mesh; larger ones are drawn coarser.
+        points: of one cloud; of larger ones a part is drawn.
+    """
+
+    faces: int = 1_000_000
+    points: int = 2_000_000
+
+
+def scene_payload(
+    items: Iterable[tuple[str, Shape]], *, up: str = "y", limits: Limits | None = None
+) -> dict[str, Any]:
+    """Pack shapes for `RendraViewer.mount`.
+
+    Args:
+        items: names, and what they name: a file that `rendra.io.IO` reads, Meshes, Pointclouds, or cameras. Every
+            mesh or cloud of a batch is an item; cameras are drawn as pyramids.
+        up: the axis that points up at first, "y" or "z".
+        limits: how much of a shape is sent; whoever looks is told what is missing.
+
+    Returns:
+        {"version", "up", "items"}, all of it numbers, text and lists.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: an unknown kind of shape or suffix, or a malformed file (MeshFormatError).
+    """
+    if up not in ("y", "z"):
+        raise ValueError(f"up is {up!r}; expected 'y' or 'z'")
+    limits = limits or Limits()
+    packed: list[dict[str, Any]] = []
+    cameras: list[tuple[str, CamerasBase]] = []
+    for name, shape in items:
+        if isinstance(shape, CamerasBase):
+            cameras.append((name, shape))
+            continue
+        known, notes = _known_shape(shape)
+        batch = [known] if len(known) == 1 else [known[i] for i in range(len(known))]
+        for number, single in enumerate(batch):
+            own = name if len(batch) == 1 else f"{name} {number}"
+            item = _mesh_item(single, limits) if isinstance(single, Meshes) else _cloud_item(single, limits)
+            packed.append({"name": own, **item, "notes": [*notes, *item["notes"]]})
+    diagonal = _diagonal(packed)
+    packed.extend({"name": name, **_camera_item(shape, diagonal)} for name, shape in cameras)
+    return {"version": 1, "up": up, "items": packed}
+
+
+def _known_shape(shape: Any) -> tuple[Meshes | Pointclouds, list[str]]:
+    """The shape, read if it is a file, and what the reader had to say."""
+    if isinstance(shape, Meshes | Pointclouds):
+        return shape, []
+    if not isinstance(shape, str | os.PathLike):
+        raise ValueError(f"a shape to view is a file, Meshes, Pointclouds or cameras, not {type(shape).__name__}")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        known = read_geometry(Path(shape))
+    return known, list(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))
+
+
+def _numbers(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().float().cpu().numpy()
+
+
+def _mesh_item(mesh: Meshes, limits: Limits) -> dict[str, Any]:
+    """A batch of one mesh."""
+    verts, faces = _numbers(mesh.verts_packed()), mesh.faces_packed().cpu().numpy()
+    counts = {"verts": len(verts), "faces": len(faces)}
+    notes: list[str] = []
+    whole = np.isfinite(verts).all(axis=1)
+    kept = np.arange(len(faces)) if whole.all() else whole[faces].all(axis=1).nonzero()[0]
+    if len(kept) < len(faces):
+        notes.append(f"{len(faces) - len(kept):,} faces are left out: their corners are not finite")
+    large = len(kept) > limits.faces
+    textures = _drawable(mesh, notes, large)
+    normals = _numbers(mesh.verts_normals_packed()) if mesh.has_given_normals and not large else None
+    colors = _rgb(textures.verts_features_packed(), notes) if isinstance(textures, TexturesVertex) else None
+    verts, faces = np.where(whole[:, None], verts, 0.0), faces[kept]
+    if large:
+        verts, faces, colors = merged_neighbours(verts, faces, colors, limits.faces)
+        notes.append(f"drawn with {len(faces):,} of {counts['faces']:,} faces: neighbouring vertices are merged")
+    parts: dict[str, Any] = {}
+    if isinstance(textures, TexturesUV):
+        rows, faces, parts = _textured(textures, faces, kept)
+        verts, normals = verts[rows], None if normals is None else normals[rows]
+    return (
+        {"kind": "mesh", "counts": counts, "notes": notes, **_bounds(verts, faces)}
+        | parts
+        | {
+            "positions": packed_positions(verts),
+            "faces": packed_indices(faces, len(verts)),
+            **({} if normals is None else {"normals": packed_normals(normals)}),
+            **({} if colors is None else {"colors": packed_colors(colors)}),
+        }
+    )
+
+
+def _drawable(mesh: Meshes, notes: list[str], large: bool) -> TexturesVertex | TexturesUV | None:
+    """The mesh's texture as one image, or as colours of vertices where it has several or must be made coarser."""
+    textures = mesh.textures
+    if textures is None or not len(mesh.faces_packed()):
+        return None
+    if isinstance(textures, TexturesAtlas) and not large:
+        if textures.atlas_packed().shape[1] > 1:
+            notes.append("every face is drawn in its mean colour")
+        return atlas_as_image(textures.atlas_packed())
+    if isinstance(textures, TexturesVertex) or (
+        isinstance(textures, TexturesUV) and not textures.multi_map and not large
+    ):
+        return textures
+    notes.append("the texture is drawn as colours of vertices")
+    return colors_at_verts(mesh)
+
+
+def _textured(
+    textures: TexturesUV, faces: np.ndarray, kept: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """The vertex of every pair of vertex and texture coordinate, faces of such pairs, and the texture's parts."""
+    faces_uvs = textures.faces_uvs_list()[0].cpu().numpy()[kept]
+    uvs = _numbers(textures.verts_uvs_list()[0])
+    keys = faces.astype(np.int64).reshape(-1) * (len(uvs) + 1) + faces_uvs.reshape(-1)
+    unique, corners = np.unique(keys, return_inverse=True)
+    image = _numbers(textures.maps_list()[0])
+    data, (width, height) = packed_image(_three_channels(image))
+    coordinates = uvs[unique % (len(uvs) + 1)]
+    if textures.align_corners:  # 0 and 1 are the centres of the outermost texels; WebGL means their outer edges
+        size = np.array([width, height])
+        coordinates = (coordinates * (size - 1) + 0.5) / size
+    parts = {
+        "uvs": packed_array(np.nan_to_num(coordinates).astype(np.float32)),
+        "texture": {
+            "image": data,
+            "repeat": "mirror" if textures.padding_mode == "reflection" else "edge",
+            "nearest": textures.sampling_mode == "nearest" or min(width, height) <= 8,
+        },
+    }
+    return unique // (len(uvs) + 1), corners.reshape(-1, 3), parts
+
+
+def _cloud_item(cloud: Pointclouds, limits: Limits) -> dict[str, Any]:
+    """A batch of one cloud."""
+    points, notes = _numbers(cloud.points_packed()), list[str]()
+    counts = {"points": len(points)}
+    chosen = np.isfinite(points).all(axis=1).nonzero()[0]
+    if len(chosen) < len(points):
+        notes.append(f"{len(points) - len(chosen):,} points are left out: they are not finite")
+    if len(chosen) > limits.points:
+        chosen = chosen[chosen_points(len(chosen), limits.points)]
+        notes.append(f"drawn with {len(chosen):,} of {len(points):,} points, chosen at random")
+    features, normals = cloud.features_packed(), cloud.normals_packed()
+    colors = None if features is None else _rgb(features, notes)
+    points = points[chosen]
+    return {"kind": "points", "counts": counts, "notes": notes, **_bounds(points)} | {
+        "positions": packed_positions(points),
+        **({} if normals is None else {"normals": packed_normals(_numbers(normals)[chosen])}),
+        **({} if colors is None else {"colors": packed_colors(colors[chosen])}),
+    }
+
+
+def _camera_item(cameras: CamerasBase, diagonal: float) -> dict[str, Any]:
+    """A pyramid for every camera: its centre and the corners of its image, with a flag on top."""
+    cameras = cameras.cpu()
+    centers = cameras.get_camera_center().detach()
+    depth = _FRUSTUM_OF_SCENE * (diagonal or float(torch.linalg.norm(_box_sides(centers))) or 1.0)
+    sides = _image_sides(cameras, len(centers))  # (N, 2)
+    square = centers.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1], [0, 1.35]])
+    xy = sides[:, None] * square
+    corners = cameras.unproject_points(torch.cat([xy, torch.full_like(xy[..., :1], depth)], dim=-1), from_ndc=True)
+    points = torch.cat([centers[:, None], corners.detach()], dim=1)  # (N, 6, 3)
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1], [1, 5], [5, 2]])
+    lines = (edges + 6 * np.arange(len(points))[:, None, None]).reshape(-1, 2)
+    flat = _numbers(points).reshape(-1, 3)
+    return {
+        "kind": "lines",
+        "counts": {"cameras": len(points)},
+        "notes": [],
+        **_bounds(flat),
+        "positions": packed_positions(flat),
+        "lines": packed_indices(lines, len(flat)),
+    }
+
+
+def _box_sides(points: Tensor) -> Tensor:
+    """The sides (3,) of the bounding box of points (P, 3); zeros if there is none."""
+    return points.amax(dim=0) - points.amin(dim=0) if len(points) else points.new_zeros(3)
+
+
+def _image_sides(cameras: CamerasBase, count: int) -> Tensor:
+    """Half the width and half the height of every camera's image in NDC, whose short side is 1. (N, 2)"""
+    size = cameras.get_image_size()
+    if size is None:
+        return torch.ones(count, 2)
+    wide = torch.as_tensor(size).float().expand(count, 2).flip(1)  # given as height, width
+    return wide / wide.amin(dim=1, keepdim=True)
+
+
+def _rgb(features: Tensor, notes: list[str]) -> np.ndarray | None:
+    """(P, 3) colours of features (P, C): their first three channels, or one as grey."""
+    channels = features.shape[-1]
+    if channels == 0 or channels == 2:
+        notes.append(f"features of {channels} channels are no colours")
+        return None
+    return _three_channels(_numbers(features))
+
+
+def _three_channels(colors: np.ndarray) -> np.ndarray:
+    return np.repeat(colors[..., :1], 3, axis=-1) if colors.shape[-1] < 3 else colors[..., :3]
+
+
+def _bounds(points: np.ndarray, faces: np.ndarray | None = None) -> dict[str, Any]:
+    """The box of what is drawn: of a mesh the corners of its faces."""
+    used = points if faces is None else points[np.unique(faces)]
+    if not len(used):
+        return {"bounds": None}
+    return {"bounds": [used.min(axis=0).tolist(), used.max(axis=0).tolist()]}
+
+
+def _diagonal(items: list[dict[str, Any]]) -> float:
+    """Of the box around all items; 0 where there is nothing."""
+    boxes = np.array([item["bounds"] for item in items if item["bounds"]], dtype=np.float64).reshape(-1, 2, 3)
+    return float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0))) if len(boxes) else 0.0
