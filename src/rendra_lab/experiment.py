@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import subprocess
@@ -27,13 +28,9 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from rendra_lab import interruptions, report, signals
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import StepTimer
-from rendra_lab.checkpoints import (
-    checkpoints_are_data,
-    find_checkpoint,
-    named_checkpoint,
-    newest_checkpoint,
-    whole,
-)
+from rendra_lab.checkpoint_io import SafeCheckpointIO, describe
+from rendra_lab.checkpoints import checkpoints_are_data, find_checkpoint, must_fit, read_weights
+from rendra_lab.durable import sweep_leftovers
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
 from rendra_lab.settings import check_run
@@ -80,7 +77,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     Raises UserError for a forbidden `_target_` or an argument that it does not take, naming the key.
     """
     quieten()
-    tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    tree: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     check_run(tree)
     check_targets(tree)
     if cfg.threads is not None:
@@ -98,7 +95,8 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
             "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
             "enable_progress_bar": any(_is_progress(callback) for callback in callbacks),
         }
-    return Experiment(cfg, task, data, instantiate(cfg.trainer, _convert_="all", **settings))
+    plugins = [SafeCheckpointIO(describe(_task_name(), tree, _commit())), *_plugins(cfg.trainer)]
+    return Experiment(cfg, task, data, instantiate(cfg.trainer, _convert_="all", plugins=plugins, **settings))
 
 
 def run(cfg: DictConfig) -> float | None:
@@ -120,7 +118,10 @@ def _run(cfg: DictConfig) -> float | None:
     try:
         experiment = build(cfg)
         wanted = cfg.ckpt_path or interruptions.requeued_from(Path(cfg.output_root), record["overrides"])
-        checkpoint = whole(find_checkpoint(wanted, folder, Path(cfg.output_root)))
+        checkpoint = find_checkpoint(wanted, folder, Path(cfg.output_root), cfg.module.get("_target_"))
+        if _is_first_process():
+            for place in {folder / "checkpoints", checkpoint.parent if checkpoint else folder}:
+                sweep_leftovers(place)
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
         with _own_processes(experiment):
@@ -151,7 +152,10 @@ def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, erro
     )
     folder = Path(cfg.run_dir)
     if _is_first_process():
-        report.write_json(folder / "metrics.json", record)
+        try:
+            report.write_json(folder / "metrics.json", record)
+        except OSError as problem:  # the disk that ended the run
+            log.warning("metrics.json could not be written: %s", problem)
     if number is None:
         return
     if _is_first_process():
@@ -165,10 +169,10 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
 
     Args:
         folder: of the run.
-        weights: `last`, `best`, or the path of a checkpoint.
+        weights: `last`, `best`, or the path of a checkpoint or of a `.safetensors` file.
         overrides: dotted keys of the configuration with other values.
 
-    Raises UserError where the folder holds no run, or no such checkpoint.
+    Raises UserError where the folder holds no run, no such checkpoint, or one that is damaged or does not fit.
     """
     folder = Path(folder)
     source = folder / ".hydra" / "config.yaml"
@@ -180,12 +184,11 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
     for key, value in (overrides or {}).items():
         OmegaConf.update(cfg, key, value)
     experiment = build(cfg, observers=False)
-    checkpoint = newest_checkpoint(folder) if weights == "last" else named_checkpoint(folder, weights)
-    whole(checkpoint)
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    state = read_weights(folder, weights, cfg.module.get("_target_"))
     experiment.data.prepare_data()
     experiment.data.setup("test")
-    experiment.task.load_state_dict(state["state_dict"])
+    with must_fit(f"{weights} of {report.short_path(folder)}"):
+        experiment.task.load_state_dict(state)
     experiment.task.eval()
     return experiment
 
@@ -218,7 +221,7 @@ class _Clock:
 
 def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock) -> dict[str, float]:
     trainer, task, data = experiment.trainer, experiment.task, experiment.data
-    with checkpoints_are_data():
+    with checkpoints_are_data(), must_fit(f"ckpt_path: {checkpoint}"):
         trainer.fit(task, datamodule=data, ckpt_path=None if checkpoint is None else str(checkpoint))
     clock.lap("fit")
     metrics = _numbers(trainer)
@@ -302,7 +305,7 @@ def _opening_record(cfg: DictConfig) -> dict[str, Any]:
     known = HydraConfig.get() if HydraConfig.initialized() else None
     return {
         "status": "running",
-        "task": known.runtime.choices.get("task", "task") if known else "task",
+        "task": _task_name(),
         "overrides": list(known.overrides.task) if known else [],
         "seed": cfg.seed,
         "optimized_metric": cfg.optimized_metric,
@@ -311,9 +314,20 @@ def _opening_record(cfg: DictConfig) -> dict[str, Any]:
         "metrics": {},
         "threads": torch.get_num_threads() if cfg.threads is None else int(cfg.threads),
         "versions": report.versions(),
-        "git_commit": report.git_commit(Path(__file__).parent),
+        "git_commit": _commit(),
         "command": " ".join(sys.argv),
     }
+
+
+def _task_name() -> str:
+    """What `task=` chose on the command line; `task` outside Hydra."""
+    known = HydraConfig.get() if HydraConfig.initialized() else None
+    return str(known.runtime.choices.get("task", "task")) if known else "task"
+
+
+@functools.cache
+def _commit() -> str | None:
+    return report.git_commit(Path(__file__).parent)
 
 
 def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
@@ -368,6 +382,12 @@ def _parts(group: DictConfig | None) -> list[Any]:
     """The parts of a group by name, without those switched off by null."""
     built = instantiate(group, _convert_="all") if group else {}
     return [part for part in built.values() if part is not None]
+
+
+def _plugins(trainer: DictConfig) -> list[Any]:
+    """Those that a configuration adds to ours."""
+    own = instantiate(trainer.get("plugins"), _convert_="all") or []
+    return own if isinstance(own, list) else [own]
 
 
 def _is_progress(callback: Any) -> bool:

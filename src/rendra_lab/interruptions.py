@@ -23,6 +23,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from rendra_lab import report, signals
+from rendra_lab.checkpoint_io import SaveError, save_weights
 from rendra_lab.signals import Interrupted
 
 _INTERACTIVE_JOBS = ("bash", "interactive")  # the names that Lightning knows such a job by
@@ -30,6 +31,8 @@ _INTERACTIVE_JOBS = ("bash", "interactive")  # the names that Lightning knows su
 
 class LastStepKeeper(Checkpoint):
     """Saves the state after the last step of a fit, be it finished, broken or interrupted.
+
+    Beside the checkpoint lie its weights alone, `weights.safetensors`.
 
     Lightning calls it after all callbacks that save nothing, so that each of them has seen the step.
 
@@ -99,12 +102,13 @@ class LastStepKeeper(Checkpoint):
         """
         self._patience.close()
         made_a_step = trainer.training and trainer.global_step > self._begun_at
-        if trainer.world_size == 1 and made_a_step and not isinstance(exception, Interrupted):
+        if trainer.world_size == 1 and made_a_step and not isinstance(exception, Interrupted | SaveError):
             self._save(trainer)
 
     def _save(self, trainer: Trainer) -> None:
         with signals.patient(for_all=True):
             trainer.save_checkpoint(self.path)
+            save_weights(trainer, Path(self.path).with_name("weights.safetensors"))
 
 
 def _wanted(trainer: Trainer) -> int | None:
@@ -123,6 +127,8 @@ def signal_of(error: BaseException) -> int | None:
         return error.number
     if isinstance(error, SIGTERMException):
         return int(signal.SIGTERM)
+    if isinstance(error, SaveError):  # whatever came before: what the run reached is not kept
+        return None
     stopped = isinstance(error, KeyboardInterrupt) or isinstance(error.__context__, KeyboardInterrupt)
     return int(signal.SIGINT) if stopped else None
 

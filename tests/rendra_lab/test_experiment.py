@@ -145,7 +145,7 @@ def test_the_checkpoint_to_resume_from(tmp_path: Path) -> None:
     old, new = (tmp_path / "toy" / name / "checkpoints" for name in ("1", "2_sweep/0_lr=1"))
     for age, folder in enumerate((old, new)):
         folder.mkdir(parents=True)
-        (folder / "last.ckpt").touch()
+        torch.save({"global_step": 1, "state_dict": {}}, folder / "last.ckpt")
         os.utime(folder / "last.ckpt", (age, age))
     here = tmp_path / "toy" / "3"
     assert find_checkpoint(None, here, tmp_path) is None
@@ -241,5 +241,5 @@ def test_a_checkpoint_that_is_cut_off_is_told(compose, tmp_path):
     run(compose(first, "task=toy", "trainer.max_steps=2"))
     checkpoint = first / "checkpoints" / "last.ckpt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
-    with pytest.raises(UserError, match="is cut off, or no checkpoint"):
+    with pytest.raises(UserError, match="is cut off, or is no checkpoint; there is no other good"):
         run(compose(tmp_path / "toy" / "2", "task=toy", f"ckpt_path={checkpoint}"))
