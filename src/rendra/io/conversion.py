@@ -35,6 +35,7 @@ _HELD: dict[str, tuple[type[TexturesBase], ...]] = {
 }
 _WITH_COMPANIONS = (".obj", ".gltf")
 _WITHOUT_NORMALS = (".stl",)
+NORMALS_LOST = "normals are not kept: some vertices have several, or none"
 _MOST_SAMPLES = 50_000_000  # with normals and colours under 10 GB
 # Rows are where x, y and z of a row vector go.
 _TURNS = {
@@ -198,7 +199,7 @@ def _read_obj(source: Path, textures: bool) -> Meshes:
         return mesh
     normals = normals_at_verts(len(verts), faces, properties.normals)
     if normals is None:
-        warnings.warn("normals are not kept: some vertices have several, or none", stacklevel=4)
+        warnings.warn(NORMALS_LOST, stacklevel=4)
         return mesh
     return Meshes(mesh.verts_list(), mesh.faces_list(), mesh.textures, verts_normals=[normals])
 

@@ -5,6 +5,6 @@
 """
 
 from rendra_lab.viewer.page import payload_json, viewer_assets, viewer_page
-from rendra_lab.viewer.scene import scene_payload
+from rendra_lab.viewer.scene import Limits, scene_payload
 
-__all__ = ["payload_json", "scene_payload", "viewer_assets", "viewer_page"]
+__all__ = ["Limits", "payload_json", "scene_payload", "viewer_assets", "viewer_page"]

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from rendra.io._carried_colors import atlas_as_image, colors_at_verts
-from rendra.io.conversion import read_geometry
+from rendra.io.conversion import NORMALS_LOST, read_geometry
+from rendra.io.obj_io import load_obj
 from rendra.renderer.cameras import CamerasBase
 from rendra.renderer.mesh.textures import TexturesAtlas, TexturesUV, TexturesVertex
 from rendra.structures import Meshes, Pointclouds
@@ -30,6 +31,11 @@ from rendra_lab.viewer.packing import (
 from rendra_lab.viewer.thinning import chosen_points, merged_neighbours
 
 Shape = str | os.PathLike[str] | Meshes | Pointclouds | CamerasBase
+_PACKERS = {
+    "uvs": lambda uvs: packed_array(uvs.astype(np.float32)),
+    "colors": packed_colors,
+    "normals": packed_normals,
+}
 _FRUSTUM_OF_SCENE = 0.06  # depth of a camera's pyramid, in diagonals of what there is beside cameras
 
 
@@ -72,65 +78,97 @@ def scene_payload(
     for name, shape in items:
         if isinstance(shape, CamerasBase):
             cameras.append((name, shape))
-            continue
-        known, notes = _known_shape(shape)
-        batch = [known] if len(known) == 1 else [known[i] for i in range(len(known))]
-        for number, single in enumerate(batch):
-            own = name if len(batch) == 1 else f"{name} {number}"
-            item = _mesh_item(single, limits) if isinstance(single, Meshes) else _cloud_item(single, limits)
-            packed.append({"name": own, **item, "notes": [*notes, *item["notes"]]})
+        elif isinstance(shape, Meshes | Pointclouds):
+            packed.extend(_batch_items(name, shape, limits))
+        elif isinstance(shape, str | os.PathLike):
+            packed.append(_file_item(name, Path(shape), limits))
+        else:
+            kind = type(shape).__name__
+            raise ValueError(f"{name}: a shape to view is a file, Meshes, Pointclouds or cameras, not {kind}")
     diagonal = _diagonal(packed)
     packed.extend({"name": name, **_camera_item(shape, diagonal)} for name, shape in cameras)
     return {"version": 1, "up": up, "items": packed}
 
 
-def _known_shape(shape: Any) -> tuple[Meshes | Pointclouds, list[str]]:
-    """The shape, read if it is a file, and what the reader had to say."""
-    if isinstance(shape, Meshes | Pointclouds):
-        return shape, []
-    if not isinstance(shape, str | os.PathLike):
-        raise ValueError(f"a shape to view is a file, Meshes, Pointclouds or cameras, not {type(shape).__name__}")
+def _batch_items(name: str, batch: Meshes | Pointclouds, limits: Limits) -> list[dict[str, Any]]:
+    """An item for each of a batch, numbered where there are several."""
+    if len(batch) == 1:
+        return [{"name": name, **_item(batch, limits)}]
+    return [{"name": f"{name} {i}", **_item(batch[i], limits)} for i in range(len(batch))]
+
+
+def _file_item(name: str, path: Path, limits: Limits) -> dict[str, Any]:
+    """What a file holds, with what its reader has to say among the notes."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        known = read_geometry(Path(shape))
-    return known, list(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))
+        shape = read_geometry(path)
+    notes = list(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))
+    corners = None
+    if NORMALS_LOST in notes:  # a vertex of a sharp edge has several: here every corner may have its own
+        notes.remove(NORMALS_LOST)
+        corners = _corner_normals(path)
+    item = _item(shape, limits, corners)
+    return {"name": name, **item, "notes": notes + item["notes"]}
+
+
+def _corner_normals(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """The normals (M, 3) of an OBJ file, and which of them the corners of its faces have (F, 3); None for gaps."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _, faces, parts = load_obj(path, load_textures=False)
+    if parts.normals is None or bool((faces.normals_idx < 0).any()):
+        return None
+    return _numbers(parts.normals), faces.normals_idx.numpy()
+
+
+def _item(
+    shape: Meshes | Pointclouds, limits: Limits, corner_normals: tuple[np.ndarray, np.ndarray] | None = None
+) -> dict[str, Any]:
+    """A batch of one."""
+    return _mesh_item(shape, limits, corner_normals) if isinstance(shape, Meshes) else _cloud_item(shape, limits)
 
 
 def _numbers(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().cpu().numpy()
 
 
-def _mesh_item(mesh: Meshes, limits: Limits) -> dict[str, Any]:
-    """A batch of one mesh."""
+def _mesh_item(mesh: Meshes, limits: Limits, corner_normals: tuple[np.ndarray, np.ndarray] | None) -> dict[str, Any]:
     verts, faces = _numbers(mesh.verts_packed()), mesh.faces_packed().cpu().numpy()
     counts = {"verts": len(verts), "faces": len(faces)}
     notes: list[str] = []
     whole = np.isfinite(verts).all(axis=1)
-    kept = np.arange(len(faces)) if whole.all() else whole[faces].all(axis=1).nonzero()[0]
+    kept = whole[faces].all(axis=1).nonzero()[0]
     if len(kept) < len(faces):
         notes.append(f"{len(faces) - len(kept):,} faces are left out: their corners are not finite")
     large = len(kept) > limits.faces
     textures = _drawable(mesh, notes, large)
-    normals = _numbers(mesh.verts_normals_packed()) if mesh.has_given_normals and not large else None
-    colors = _rgb(textures.verts_features_packed(), notes) if isinstance(textures, TexturesVertex) else None
+    values: dict[str, np.ndarray] = {}
+    if isinstance(textures, TexturesVertex) and (colors := _rgb(textures.verts_features_packed(), notes)) is not None:
+        values["colors"] = colors
     verts, faces = np.where(whole[:, None], verts, 0.0), faces[kept]
     if large:
-        verts, faces, colors = merged_neighbours(verts, faces, colors, limits.faces)
+        verts, faces, values = merged_neighbours(verts, faces, values, limits.faces)
         notes.append(f"drawn with {len(faces):,} of {counts['faces']:,} faces: neighbouring vertices are merged")
-    parts: dict[str, Any] = {}
+    elif mesh.has_given_normals:
+        values["normals"] = _numbers(mesh.verts_normals_packed())
+    # values that belong to corners of faces, not to vertices: a table and the row that each corner has
+    tables: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     if isinstance(textures, TexturesUV):
-        rows, faces, parts = _textured(textures, faces, kept)
-        verts, normals = verts[rows], None if normals is None else normals[rows]
-    return (
-        {"kind": "mesh", "counts": counts, "notes": notes, **_bounds(verts, faces)}
-        | parts
-        | {
-            "positions": packed_positions(verts),
-            "faces": packed_indices(faces, len(verts)),
-            **({} if normals is None else {"normals": packed_normals(normals)}),
-            **({} if colors is None else {"colors": packed_colors(colors)}),
-        }
-    )
+        tables["uvs"] = _numbers(textures.verts_uvs_list()[0]), textures.faces_uvs_list()[0].cpu().numpy()[kept]
+    if corner_normals is not None and not large:
+        tables["normals"] = corner_normals[0], corner_normals[1][kept]
+    verts, faces, values = _split(verts, faces, values, tables)
+    texture = _texture(textures, values) if isinstance(textures, TexturesUV) else {}
+    return {
+        "kind": "mesh",
+        "counts": counts,
+        "notes": notes,
+        **_bounds(verts, faces),
+        "positions": packed_positions(verts),
+        "faces": packed_indices(faces, len(verts)),
+        **{name: _PACKERS[name](array) for name, array in values.items()},
+        **texture,
+    }
 
 
 def _drawable(mesh: Meshes, notes: list[str], large: bool) -> TexturesVertex | TexturesUV | None:
@@ -141,7 +179,9 @@ def _drawable(mesh: Meshes, notes: list[str], large: bool) -> TexturesVertex | T
     if isinstance(textures, TexturesAtlas) and not large:
         if textures.atlas_packed().shape[1] > 1:
             notes.append("every face is drawn in its mean colour")
-        return atlas_as_image(textures.atlas_packed())
+        image = atlas_as_image(textures.atlas_packed())
+        image.sampling_mode = "nearest"  # a texel is a face: its neighbours must not shine through
+        return image
     if isinstance(textures, TexturesVertex) or (
         isinstance(textures, TexturesUV) and not textures.multi_map and not large
     ):
@@ -150,29 +190,48 @@ def _drawable(mesh: Meshes, notes: list[str], large: bool) -> TexturesVertex | T
     return colors_at_verts(mesh)
 
 
-def _textured(
-    textures: TexturesUV, faces: np.ndarray, kept: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """The vertex of every pair of vertex and texture coordinate, faces of such pairs, and the texture's parts."""
-    faces_uvs = textures.faces_uvs_list()[0].cpu().numpy()[kept]
-    uvs = _numbers(textures.verts_uvs_list()[0])
-    keys = faces.astype(np.int64).reshape(-1) * (len(uvs) + 1) + faces_uvs.reshape(-1)
-    unique, corners = np.unique(keys, return_inverse=True)
-    image = _numbers(textures.maps_list()[0])
-    data, (width, height) = packed_image(_three_channels(image))
-    coordinates = uvs[unique % (len(uvs) + 1)]
-    if textures.align_corners:  # 0 and 1 are the centres of the outermost texels; WebGL means their outer edges
+def _split(
+    verts: np.ndarray,
+    faces: np.ndarray,
+    values: dict[str, np.ndarray],
+    tables: dict[str, tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """A mesh whose vertices carry all values: one for every combination that corners of faces have.
+
+    Args:
+        verts: (V, 3).
+        faces: (F, 3) rows of `verts`.
+        values: by name, of the vertices (V, C).
+        tables: by name, rows (M, C) and which of them each corner has (F, 3).
+    """
+    if not tables:
+        return verts, faces, values
+    keys = faces.astype(np.int64)
+    for table, rows in tables.values():
+        keys = keys * len(table) + rows
+    unique, corners = np.unique(keys.reshape(-1), return_inverse=True)
+    found = {}
+    for name, (table, _) in reversed(tables.items()):
+        found[name] = table[unique % len(table)]
+        unique = unique // len(table)
+    return verts[unique], corners.reshape(-1, 3), {name: array[unique] for name, array in values.items()} | found
+
+
+def _texture(textures: TexturesUV, values: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The image and how it is read; `values["uvs"]` become what WebGL means by texture coordinates."""
+    image = _three_channels(_numbers(textures.maps_list()[0]))
+    data, (width, height) = packed_image(image)
+    values["uvs"] = np.nan_to_num(values["uvs"])
+    if textures.align_corners:  # 0 and 1 are the centres of the outermost texels, in WebGL their outer edges
         size = np.array([width, height])
-        coordinates = (coordinates * (size - 1) + 0.5) / size
-    parts = {
-        "uvs": packed_array(np.nan_to_num(coordinates).astype(np.float32)),
+        values["uvs"] = (values["uvs"] * (size - 1) + 0.5) / size
+    return {
         "texture": {
             "image": data,
             "repeat": "mirror" if textures.padding_mode == "reflection" else "edge",
-            "nearest": textures.sampling_mode == "nearest" or min(width, height) <= 8,
-        },
+            "nearest": textures.sampling_mode == "nearest",
+        }
     }
-    return unique // (len(uvs) + 1), corners.reshape(-1, 3), parts
 
 
 def _cloud_item(cloud: Pointclouds, limits: Limits) -> dict[str, Any]:

@@ -6,8 +6,8 @@ _STEPS = 12  # of the search for a cell: it halves an interval of its logarithm
 
 
 def merged_neighbours(
-    verts: np.ndarray, faces: np.ndarray, colors: np.ndarray | None, most: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    verts: np.ndarray, faces: np.ndarray, values: dict[str, np.ndarray], most: int
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """A mesh of at most `most` faces: the vertices of each cell of a grid become their mean.
 
     Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Robust against any
@@ -16,7 +16,7 @@ def merged_neighbours(
     Args:
         verts: (V, 3), finite.
         faces: (F, 3) rows of `verts`.
-        colors: (V, 3), or None.
+        values: by name, of the vertices (V, C).
         most: faces, at least 1.
     """
     low, side = verts.min(axis=0), float(np.ptp(verts, axis=0).max()) or 1.0
@@ -31,8 +31,8 @@ def merged_neighbours(
             coarse, best = middle, cells
     kept = _distinct(best[faces])
     counts = np.bincount(best)[:, None]
-    mean = [_sums(values, best) / counts for values in (verts, colors) if values is not None]
-    return mean[0].astype(np.float32), kept, mean[1] if colors is not None else None
+    merged = {name: _sums(array, best) / counts for name, array in values.items()}
+    return (_sums(verts, best) / counts).astype(np.float32), kept, merged
 
 
 def _cells(verts: np.ndarray, low: np.ndarray, cell: float) -> np.ndarray:

@@ -144,6 +144,14 @@ function boxAround(boxes) {
   ];
 }
 
+// The volume that two boxes share, as a part of that of both together; sides of no length count as a little.
+function sharedPart(a, b) {
+  const low = Math.max(...subtract(a[1], a[0]), ...subtract(b[1], b[0])) * 1e-3;
+  const volume = (from, to) => [0, 1, 2].reduce((product, i) => product * Math.max(0, to[i] - from[i] + low), 1);
+  const shared = volume([0, 1, 2].map((i) => Math.max(a[0][i], b[0][i])), [0, 1, 2].map((i) => Math.min(a[1][i], b[1][i])));
+  return shared / (volume(a[0], a[1]) + volume(b[0], b[1]) - shared || 1);
+}
+
 // 1, 2 or 5 times a power of ten, not below x.
 function roundStep(x) {
   const power = Math.pow(10, Math.floor(Math.log10(x)));

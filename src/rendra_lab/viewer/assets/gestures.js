@@ -68,9 +68,9 @@ function listen(canvas, actions) {
 
   function key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const arrow = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (arrow && event.shiftKey) actions.pan(arrow[0] * 0.05, arrow[1] * 0.05);
-    else if (arrow) actions.turn(-arrow[0] * ARROW_TURN, -arrow[1] * -ARROW_TURN);
+    else if (arrow) actions.turn(arrow[0] * ARROW_TURN, arrow[1] * ARROW_TURN);
     else if (event.key === "+" || event.key === "=") actions.zoom(0.85);
     else if (event.key === "-" || event.key === "_") actions.zoom(1 / 0.85);
     else if (event.key === "Escape") canvas.blur();

@@ -81,7 +81,7 @@ void main() {
     float facing = dot(n, normalize(eye - place));
     float lamp = abs(facing);
     float sky = dot(n, up) * (facing < 0.0 ? -1.0 : 1.0);
-    color = color * (0.36 + 0.58 * lamp + 0.1 * sky) + 0.1 * pow(lamp, 40.0);
+    color = color * (0.44 + 0.52 * lamp + 0.08 * sky) + 0.08 * pow(lamp, 40.0);
   }
   shown = vec4(color, 1.0);
 }`;

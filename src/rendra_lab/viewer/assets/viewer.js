@@ -12,16 +12,31 @@ class Scene {
     this.origin = box ? scaled(add(box[0], box[1]), 0.5) : [0, 0, 0];
     this.ratio = 1;
     this.version = 0;
-    this.arrange(false);
+    this.arrange(this.crowded());
   }
 
-  // Items where they are, or in a row along x.
-  arrange(apart) {
+  // Whether shapes of one kind lie in one another, as versions of one thing do: then they start side by side.
+  crowded() {
     const placed = this.items.filter((item) => item.bounds);
-    const widest = Math.max(0, ...placed.map((item) => item.bounds[1][0] - item.bounds[0][0]));
-    const tallest = Math.max(0, ...placed.map((item) => item.bounds[1][1] - item.bounds[0][1]));
-    const step = 1.15 * Math.max(widest, 0.25 * tallest);
-    placed.forEach((item, i) => { item.offset = [apart ? step * (i - (placed.length - 1) / 2) : 0, 0, 0]; });
+    return placed.some((a, i) => placed.slice(i + 1).some((b) => a.kind === b.kind && sharedPart(a.bounds, b.bounds) > 0.3));
+  }
+
+  // Items where they are, or middle beside middle in a row along x; lines stay with the first of the others.
+  arrange(apart) {
+    this.apart = apart;
+    for (const item of this.items) item.offset = [0, 0, 0];
+    const placed = this.items.filter((item) => item.bounds && item.kind !== "lines");
+    if (apart && placed.length) {
+      const sides = placed.map((item) => subtract(item.bounds[1], item.bounds[0]));
+      const gap = 0.15 * Math.max(...sides.map((side) => Math.max(...side)));
+      let left = -(sides.reduce((sum, side) => sum + side[0], 0) + gap * (placed.length - 1)) / 2;
+      placed.forEach((item, i) => {
+        const middle = subtract(scaled(add(...item.bounds), 0.5), this.origin);
+        item.offset = subtract([left + sides[i][0] / 2, 0, 0], middle);
+        left += sides[i][0] + gap;
+      });
+      for (const item of this.items) if (item.kind === "lines") item.offset = placed[0].offset;
+    }
     this.measure();
   }
 
@@ -72,7 +87,7 @@ class Viewer {
     this.root = root;
     this.scene = new Scene(payload);
     this.state = {
-      look: 0, facets: "auto", faces: true, edges: false, grid: true, axes: true, apart: false, ratio: 1,
+      look: 0, facets: "auto", faces: true, edges: false, grid: true, axes: true, apart: this.scene.apart, ratio: 1,
       up: payload.up || "y", background: options.background || preferredGround(), pointSize: firstPointSize(this.scene),
     };
     this.view = new View(this.state.up, options);
@@ -165,6 +180,7 @@ class Viewer {
     });
     this.canvas.addEventListener("webglcontextrestored", () => this.prepare());
     new ResizeObserver(() => this.resize()).observe(this.root);
+    window.addEventListener("resize", () => this.resize());  // zooming the page changes pixels alone
     new IntersectionObserver((entries) => {
       this.visible = entries[entries.length - 1].isIntersecting;
       if (this.visible) this.wake();
@@ -205,7 +221,12 @@ class Viewer {
   prepare() {
     if (this.gl.isContextLost()) return;
     this.panel.say(this.scene.box ? "" : this.panel.message.textContent);
-    this.drawing = new Drawing(this.gl, this.scene, () => this.changed());
+    try {
+      this.drawing = new Drawing(this.gl, this.scene, () => this.changed());
+    } catch (error) {
+      this.panel.say("The graphics device cannot draw this: " + error.message);
+      throw error;
+    }
     this.resize();
     this.changed();
   }
