@@ -39,6 +39,7 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         super().__init__()
         self.losses = nn.ModuleDict(_without_nulls(losses))
         self.metrics = nn.ModuleDict(_without_nulls(metrics))
+        self.step_losses: dict[str, Tensor] = {}  # by name, of the update to come: what `NanGuard` judges
 
     @abstractmethod
     def predict(self, batch: BatchT) -> PredictionT:
@@ -167,11 +168,12 @@ class Task(BaseTask[BatchT, PredictionT]):
         prediction = self.predict(batch)
         total, terms = self.objective(prediction, batch)
         values = {f"train/loss_{name}": value.detach() for name, value in terms.items()}
+        self.step_losses = {"train/loss": total.detach(), **values}
         metrics = cast(Iterator[tuple[str, MetricTerm]], self.metrics.items())
         watched = {
             f"train/{name}": _named(name, term, prediction, batch) for name, term in metrics if term.in_training
         }
-        self.log_dict({"train/loss": total.detach(), **values, **watched}, prog_bar=True, batch_size=1)
+        self.log_dict({**self.step_losses, **watched}, prog_bar=True, batch_size=1)
         return total
 
     def on_train_batch_start(self, batch: BatchT, batch_idx: int) -> None:

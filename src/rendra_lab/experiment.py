@@ -33,6 +33,7 @@ from rendra_lab.checkpoints import checkpoints_are_data, find_checkpoint, must_f
 from rendra_lab.durable import sweep_leftovers
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
+from rendra_lab.nan_guard import NanGuard
 from rendra_lab.settings import check_run
 from rendra_lab.targets import check_targets
 
@@ -49,6 +50,7 @@ _IDLE_WARNINGS = (
     r".*you defined a `validation_step` but have no `val_dataloader`.*",
     r"The dirpath has changed from.*",
     r".*LeafSpec.*is deprecated.*",
+    r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint.*",
 )
 
 
@@ -89,6 +91,8 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     settings: dict[str, Any] = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     if observers:
         callbacks = _parts(cfg.callbacks)
+        for guard in (callback for callback in callbacks if isinstance(callback, NanGuard)):
+            guard.config = OmegaConf.to_yaml(cfg, resolve=True)
         settings = {
             "logger": _parts(cfg.logger) or False,
             "callbacks": callbacks,

@@ -1,4 +1,4 @@
-"""Signals that end a program: SIGINT (Ctrl-C), SIGTERM and SIGUSR1 become one exception, raised where it harms nothing.
+"""Signals that end a program (SIGINT, SIGTERM, SIGUSR1) become one exception, raised where it harms nothing.
 
 Imported before anything else runs: stays light.
 """
