@@ -1,8 +1,10 @@
 """The meshes that tasks and scripts start from: made here, or read from the user's file."""
 
+import hashlib
 import math
 import warnings
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,10 @@ from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra.utils.ico_sphere import ico_sphere
 from rendra.utils.torus import torus
+from rendra_lab.data.kept_tensors import kept_or_made
 from rendra_lab.errors import UserError
-from rendra_lab.synthesis.cow import CoatParameters, CowParameters, make_cow
+from rendra_lab.synthesis import cow_arrays
+from rendra_lab.synthesis.cow import CoatParameters, CowParameters, TexturedMesh, as_meshes, build_cow, make_cow
 
 Device = torch.device | str
 NORMALIZATIONS = ("center", "extent", "max_abs")
@@ -42,7 +46,8 @@ def load_mesh(
         size: of the normalised mesh.
         device: where the mesh goes.
         **options: of our own meshes, ignored where there is a path. cow: seed, texture_size, num_faces, breed,
-            build (a mapping of CowParameters' fields). ico_sphere: level. torus: r, R, sides, rings.
+            build (a mapping of CowParameters' fields), cache (a folder for cows that were made). ico_sphere: level.
+            torus: r, R, sides, rings.
 
     Returns:
         A batch of one mesh; white vertex colours where the file has none. An OBJ file with several images, or with
@@ -121,9 +126,28 @@ def _cow(
     num_faces: int = 9600,
     breed: str = "holstein",
     build: Mapping[str, float] | None = None,
+    cache: str | Path | None = None,
 ) -> Meshes:
     shape, coat = CowParameters(**(build or {})), CoatParameters.of_breed(breed)
-    return make_cow(seed, texture_size, num_faces, build=shape, coat=coat, device=device)
+    how: dict[str, Any] = {"build": shape, "coat": coat}
+    how |= {"seed": seed, "texture_size": texture_size, "num_faces": num_faces}
+    if cache is None:
+        return make_cow(**how, device=device)
+
+    def made() -> dict[str, Tensor]:
+        return {name: torch.from_numpy(array) for name, array in vars(build_cow(**how)).items()}
+
+    kept = kept_or_made(Path(cache) / f"cow_{_fingerprint(how)}.safetensors", "cow", made)
+    return as_meshes(TexturedMesh(**{name: tensor.numpy() for name, tensor in kept.items()}), device)
+
+
+def _fingerprint(how: Mapping[str, Any]) -> str:
+    """24 hexadecimal digits that stand for everything that determines a cow, the code that makes it included."""
+    versions = [version(package) for package in ("numpy", "scipy", "scikit-image")]
+    digest = hashlib.sha256(repr((sorted(how.items()), versions)).encode())
+    for source in sorted(Path(cow_arrays.__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:24]
 
 
 def _ico_sphere(device: Device, level: int = 4) -> Meshes:

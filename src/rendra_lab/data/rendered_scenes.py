@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-import logging
-import os
-import tempfile
-import zlib
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from rendra.structures import Meshes
 from rendra_lab.data.camera_rigs import look_at_origin, rig
+from rendra_lab.data.kept_tensors import kept_or_made
 from rendra_lab.data.mesh_photographs import MeshPhotographer, Shots
 from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.data.ray_views import Scene, SceneViews
 from rendra_lab.data.scene_box import estimate_box
 from rendra_lab.errors import UserError
 
-log = logging.getLogger(__name__)
-
-_EDITION = "1"  # of the pictures; another one makes all cached ones anew
+_EDITION = "2"  # of the pictures; another one makes all cached ones anew
 _TEXTURE_PARTS = ("maps_padded", "faces_uvs_padded", "verts_uvs_padded", "verts_features_packed", "atlas_packed")
 _TEXTURE_MODES = ("padding_mode", "sampling_mode", "align_corners")
 
@@ -119,13 +112,8 @@ class RenderedScene(SceneViews):
         """The pixels of all views: (P, 4) uint8."""
         if self.cache is None:
             return self._take()
-        count = int(self.shots.sizes.prod(1).sum())
         path = self.cache / f"views_{fingerprint(self.photographer, self.shots)}.safetensors"
-        pixels = read_pixels(path, count)
-        if pixels is None:
-            pixels = self._take()
-            write_pixels(path, pixels)
-        return pixels
+        return kept_or_made(path, "views", lambda: {"pixels": self._take()})["pixels"]
 
     def _take(self) -> Tensor:
         return torch.cat([image.reshape(-1, 4) for image in self.photographer.take(self.shots)])
@@ -156,37 +144,6 @@ def fingerprint(photographer: MeshPhotographer, shots: Shots) -> str:
     return digest.hexdigest()[:24]
 
 
-def read_pixels(path: Path, count: int) -> Tensor | None:
-    """Cached pixels (count, 4) uint8; None where there are none or the file is broken."""
-    if not path.is_file():
-        return None
-    try:
-        with safe_open(path, "pt") as file:
-            pixels, checksum = file.get_tensor("pixels"), (file.metadata() or {}).get("crc32")
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        log.warning("the cached views %s are made anew: %s", path, error)
-        return None
-    if pixels.dtype != torch.uint8 or pixels.shape != (count, 4) or checksum != _checksum(pixels):
-        log.warning("the cached views %s are made anew: they are not what was written", path)
-        return None
-    return pixels
-
-
-def write_pixels(path: Path, pixels: Tensor) -> None:
-    """Write pixels to the cache, all or nothing; a cache that cannot be written is a warning."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-        os.close(handle)
-        try:
-            save_file({"pixels": pixels.contiguous()}, name, {"crc32": _checksum(pixels)})
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
-    except OSError as error:
-        log.warning("views cannot be cached in %s: %s", path.parent, error)
-
-
 def _determinants(photographer: MeshPhotographer, shots: Shots) -> Iterator[Any]:
     mesh, lights, textures = photographer.mesh, photographer.lights, photographer.mesh.textures
     yield from (_EDITION, _version("rendra"), torch.__version__, str(mesh.device), photographer.antialias)
@@ -205,10 +162,6 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
-
-
-def _checksum(pixels: Tensor) -> str:
-    return str(zlib.crc32(pixels.contiguous().numpy().data))
 
 
 def _bounds(verts: Tensor) -> tuple[Tensor, Tensor]:

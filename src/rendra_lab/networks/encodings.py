@@ -121,24 +121,39 @@ class SphericalHarmonics(nn.Module):
     def forward(self, directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M D"]:
         """Values of unit directions."""
         x, y, z = directions.unbind(-1)
-        zz, across = z * z, x * x - y * y
-        values = [
-            _norm(1, 4) * torch.ones_like(x),
-            *(_norm(3, 4) * axis for axis in (y, z, x)),
+        bands = (self._band_0, self._band_1, self._band_2, self._band_3)
+        return torch.stack([value for band in bands[: self.bands] for value in band(x, y, z)], -1)
+
+    @staticmethod
+    def _band_0(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+        return [torch.full_like(x, _norm(1, 4))]
+
+    @staticmethod
+    def _band_1(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+        return [_norm(3, 4) * axis for axis in (y, z, x)]
+
+    @staticmethod
+    def _band_2(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+        return [
             _norm(15, 4) * x * y,
             _norm(15, 4) * y * z,
-            _norm(5, 16) * (3 * zz - 1),
+            _norm(5, 16) * (3 * z * z - 1),
             _norm(15, 4) * x * z,
-            _norm(15, 16) * across,
+            _norm(15, 16) * (x * x - y * y),
+        ]
+
+    @staticmethod
+    def _band_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+        zz = z * z
+        return [
             _norm(35, 32) * y * (3 * x * x - y * y),
             _norm(105, 4) * x * y * z,
             _norm(21, 32) * y * (5 * zz - 1),
             _norm(7, 16) * z * (5 * zz - 3),
             _norm(21, 32) * x * (5 * zz - 1),
-            _norm(105, 16) * z * across,
+            _norm(105, 16) * z * (x * x - y * y),
             _norm(35, 32) * x * (x * x - 3 * y * y),
         ]
-        return torch.stack(values[: self.width], -1)
 
 
 def _norm(numerator: int, denominator: int) -> float:

@@ -14,7 +14,7 @@ from rendra_lab.synthesis.cow_anatomy import CowParameters
 from rendra_lab.synthesis.cow_arrays import TexturedMesh, build_cow
 from rendra_lab.synthesis.cow_coat import BREEDS, CoatParameters
 
-__all__ = ["BREEDS", "CoatParameters", "CowParameters", "TexturedMesh", "build_cow", "make_cow"]
+__all__ = ["BREEDS", "CoatParameters", "CowParameters", "TexturedMesh", "as_meshes", "build_cow", "make_cow"]
 
 
 def make_cow(
@@ -27,7 +27,11 @@ def make_cow(
     device: torch.device | str = "cpu",
 ) -> Meshes:
     """A batch of one cow with `TexturesUV` on `device`; the other arguments are those of `build_cow`."""
-    cow = build_cow(seed, texture_size, num_faces, size, build, coat)
+    return as_meshes(build_cow(seed, texture_size, num_faces, size, build, coat), device)
+
+
+def as_meshes(cow: TexturedMesh, device: torch.device | str = "cpu") -> Meshes:
+    """A batch of one textured mesh with `TexturesUV` on `device`."""
     verts, faces, uvs, faces_uvs, image = (
         torch.from_numpy(array).to(device)
         for array in (cow.verts, cow.faces, cow.verts_uvs, cow.faces_uvs, cow.texture)

@@ -29,6 +29,22 @@ def test_the_default_is_the_textured_cow() -> None:
     assert not torch.equal(mesh.textures.maps_padded(), other.textures.maps_padded())
 
 
+def test_a_cow_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    how = {"cache": tmp_path, "texture_size": 128, "num_faces": 2000}
+    first = load_mesh("cow", **how)
+    load_mesh("cow", **how, seed=1)
+    load_mesh("cow", **how, build={"head": 1.1})
+    load_mesh("cow", **how, breed="grey")
+    assert len(list(tmp_path.iterdir())) == 4
+    monkeypatch.setattr("rendra_lab.data.meshes.build_cow", None)
+    again, plain = load_mesh("cow", **how), load_mesh("cow", texture_size=128, num_faces=2000)
+    for other in (again, plain):
+        assert torch.equal(other.verts_packed(), first.verts_packed())
+        assert torch.equal(other.faces_packed(), first.faces_packed())
+        for part in ("verts_uvs_padded", "faces_uvs_padded", "maps_padded"):
+            assert torch.equal(getattr(other.textures, part)(), getattr(first.textures, part)())
+
+
 @pytest.mark.parametrize(
     ("name", "options", "faces"),
     [

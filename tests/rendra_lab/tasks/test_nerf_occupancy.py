@@ -174,6 +174,23 @@ def test_pieces_change_nothing(at_once: int) -> None:
         assert_close(renderer(field, rays_at_once=at_once)(rays).rgb, whole.rgb)
 
 
+@pytest.mark.parametrize("at_once", [1, 37, 10**6])
+def test_a_field_is_asked_piece_by_piece(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few rays can have many samples: memory is bounded by theirs."""
+    made, rays = renderer(Cloud()), through(5)
+    whole = made.render(rays)
+    asked = made.field.asked
+    monkeypatch.setattr("rendra_lab.tasks.nerf.occupancy._POINTS_AT_ONCE", at_once)
+    most: list[int] = []
+    monkeypatch.setattr(Cloud, "forward", lambda self, *what: most.append(len(what[0])) or Fog.forward(self, *what))
+    with torch.no_grad():
+        seen = made(rays)
+    assert made.field.asked == 2 * asked
+    assert max(most) <= at_once
+    for name in ("rgb", "opacity", "depth"):
+        assert_close(getattr(seen, name), getattr(whole, name))
+
+
 @pytest.mark.parametrize("grad", [True, False])
 @pytest.mark.parametrize("looks_first", [True, False])
 def test_where_there_is_nothing_nothing_is_seen(grad: bool, looks_first: bool) -> None:

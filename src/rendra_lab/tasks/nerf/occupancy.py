@@ -65,7 +65,7 @@ class OccupancyRenderer(RayRenderer):
         stop_below: float = 1e-3,
         looks_first: bool = False,
         jitter: bool = True,
-        rays_at_once: int = 16384,
+        rays_at_once: int = 65536,
     ) -> None:
         super().__init__(field, rays_at_once)
         if min(cells, steps_across, refresh_every) < 1:
@@ -153,9 +153,17 @@ class OccupancyRenderer(RayRenderer):
             points, middles, lengths, ray_index = (
                 values.index_select(0, kept) for values in (points, middles, lengths, ray_index)
             )
-        alphas, rgb = self.field(points, rays.directions, lengths, ray_index)
+        alphas, rgb = self._ask(points, rays.directions, lengths, ray_index)
         light = composite_alphas(alphas, rgb, middles, ray_first)
         return RaysSeen(light.features, light.opacity, light.depth)
+
+    def _ask(self, points: Tensor, directions: Tensor, lengths: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """The field's opacities (M,) and light (M, 3); piece by piece where no gradient is wanted."""
+        if torch.is_grad_enabled() or len(points) <= _POINTS_AT_ONCE:
+            return self.field(points, directions, lengths, ray_index)
+        pieces = zip(*(rows.split(_POINTS_AT_ONCE) for rows in (points, lengths, ray_index)), strict=True)
+        asked = [self.field(some, directions, length, index) for some, length, index in pieces]
+        return torch.cat([alphas for alphas, _ in asked]), torch.cat([rgb for _, rgb in asked])
 
     def looks_at(self, points: Tensor) -> Tensor:
         """Whether points (M, 3) lie in cells that are not empty: (M,) bool."""

@@ -1,0 +1,75 @@
+"""Tensors that take long to make, kept in files: whole, checked when read, and made anew where anything is wrong."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+Tensors = Mapping[str, Tensor]
+
+
+def kept_or_made(path: Path, what: str, make: Callable[[], Tensors]) -> Tensors:
+    """The tensors of a file; where there is none, or a broken one, those that are made now, and kept there.
+
+    A folder that cannot be written is a warning, and a broken file is another.
+
+    Args:
+        path: whose name stands for everything that determines the tensors.
+        what: they are, for the warnings: "views".
+        make: the tensors, on the CPU.
+    """
+    tensors = _read(path, what)
+    if tensors is None:
+        tensors = make()
+        _write(path, what, tensors)
+    return tensors
+
+
+def _read(path: Path, what: str) -> Tensors | None:
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, "pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            checksum = (file.metadata() or {}).get("crc32")
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        log.warning("the cached %s %s are made anew: %s", what, path, error)
+        return None
+    if checksum != _checksum(tensors):
+        log.warning("the cached %s %s are made anew: they are not what was written", what, path)
+        return None
+    return tensors
+
+
+def _write(path: Path, what: str, tensors: Tensors) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+        os.close(handle)
+        try:
+            whole = {key: tensor.contiguous() for key, tensor in tensors.items()}
+            save_file(whole, name, {"crc32": _checksum(whole)})
+            os.replace(name, path)
+        finally:
+            Path(name).unlink(missing_ok=True)
+    except OSError as error:
+        log.warning("%s cannot be cached in %s: %s", what, path.parent, error)
+
+
+def _checksum(tensors: Tensors) -> str:
+    total = 0
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        total = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), total)
+        total = zlib.crc32(tensor.contiguous().numpy().tobytes(), total)
+    return str(total)
