@@ -25,7 +25,7 @@ from lightning.pytorch.utilities.model_helpers import is_overridden
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from rendra_lab import interruptions, report, signals
+from rendra_lab import html_report, interruptions, report, signals
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import StepTimer
 from rendra_lab.checkpoint_io import SafeCheckpointIO, describe
@@ -160,6 +160,7 @@ def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, erro
             report.write_json(folder / "metrics.json", record)
         except OSError as problem:  # the disk that ended the run
             log.warning("metrics.json could not be written: %s", problem)
+        html_report.leave_run_report(folder, cfg.report)
     if number is None:
         return
     if _is_first_process():
@@ -340,7 +341,8 @@ def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
             logger.log_hyperparams(hyperparameters(experiment.cfg), record["metrics"])
             logger.close()
     report.write_json(experiment.folder / "metrics.json", record)
-    report.closing_table(record, experiment.folder)
+    page = html_report.leave_run_report(experiment.folder, experiment.cfg.report)
+    report.closing_table(record, experiment.folder, page)
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
@@ -401,7 +403,7 @@ def _is_progress(callback: Any) -> bool:
 
 
 def _is_first_process() -> bool:
-    return rank_zero_only.rank == 0
+    return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _seed(cfg: DictConfig) -> int:

@@ -22,12 +22,16 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
     NaN and infinities become null, as JSON knows none of them.
     """
+    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, content: str) -> None:
+    """Writes a text file atomically, into a folder that is made where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with partial.open("w", encoding="utf-8") as file:
-            json.dump(_finite(content), file, indent=2, allow_nan=False)
-            file.write("\n")
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
@@ -92,8 +96,8 @@ def peak_memory_mb() -> dict[str, float]:
     return peaks
 
 
-def closing_table(record: Mapping[str, Any], folder: Path) -> None:
-    """Prints the final numbers, where the results lie, and how to look at them."""
+def closing_table(record: Mapping[str, Any], folder: Path, page: Path | None = None) -> None:
+    """Prints the final numbers, where the results and their page lie, and how to look at them."""
     from rich.console import Console
     from rich.table import Table
 
@@ -106,6 +110,8 @@ def closing_table(record: Mapping[str, Any], folder: Path) -> None:
     console.print(table)
     place = short_path(folder)
     console.print(f"results   {place}", highlight=False, soft_wrap=True)
+    if page is not None:
+        console.print(f"report    {short_path(page)}", highlight=False, soft_wrap=True)
     console.print(f"look      tensorboard --logdir {place}", highlight=False, soft_wrap=True)
 
 
