@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import logging
 import os
 import subprocess
@@ -250,7 +251,8 @@ def _own_processes(experiment: Experiment) -> Iterator[None]:
     arguments, environment = sys.argv, dict(os.environ)
     if known is not None and known.mode == RunMode.MULTIRUN:
         hydra_own = [item for item in known.overrides.hydra if not item.startswith("hydra.mode=")]
-        sys.argv = [arguments[0], *known.overrides.task, *hydra_own]
+        resumed = [] if experiment.cfg.ckpt_path is None else [f"ckpt_path={json.dumps(experiment.cfg.ckpt_path)}"]
+        sys.argv = [arguments[0], *known.overrides.task, *resumed, *hydra_own]
         with read_write(known):  # type: ignore[arg-type]
             known.run.dir = str(experiment.folder)
     try:
@@ -347,7 +349,7 @@ def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
     """The numbers, words and switches that distinguish runs, by dotted key, for TensorBoard's HPARAMS tab."""
-    skipped = {"trainer", "logger", "callbacks", "run_dir", "output_root", "ckpt_path", "direction"}
+    skipped = {"trainer", "logger", "callbacks", "run_dir", "output_root", "ckpt_path", "direction", "sweep"}
     tree = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(tree, dict)
     tree["module"] = {
