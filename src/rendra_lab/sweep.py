@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from rendra_lab.errors import UserError
+from rendra_lab.html_report import leave_sweep_report
 from rendra_lab.ledger import JobState, Ledger
 from rendra_lab.report import format_number, short_path, shown_metrics, write_json, write_text
 from rendra_lab.sweep_job import SweepOptions, job_key
@@ -133,11 +134,18 @@ def _swept_words(config: DictConfig) -> str:
 
 
 def conclude_sweep() -> bool | None:
-    """Prints the table of the sweep that this process ran; whether all its runs succeeded, None without one."""
+    """Prints the table of the sweep that this process ran, and leaves its page; whether all its runs succeeded.
+
+    None where this process ran no sweep.
+    """
     rows = write_summary(_running[0]) if _running and _running[0].is_dir() else []
     if not rows:
         return None
-    _print_table(_running.pop(), rows)
+    folder = _running.pop()
+    page = leave_sweep_report(folder, wanted=any(row["settings"].get("report") != "false" for row in rows))
+    _print_table(folder, rows)
+    if page is not None:
+        sys.stdout.write(f"report    {short_path(page)}\n")
     return all(row["status"] == "ok" for row in rows)
 
 

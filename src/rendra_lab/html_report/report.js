@@ -23,7 +23,7 @@
   function format(value) {
     if (value === null || value === undefined) return "-";
     const size = Math.abs(value);
-    if (size !== 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(2).replace("e+", "e");
+    if (size !== 0 && (size < 1e-3 || size >= 1e6)) return Number(value.toPrecision(3)).toExponential().replace("e+", "e");
     return String(Number(value.toPrecision(5)));
   }
 
@@ -65,7 +65,7 @@
     const place = log ? Math.log : (value) => value;
     const ticks = log ? logTicks(low, high) : linearTicks(low, high, 4);
     const at = (value) => from + ((place(value) - place(low)) / (place(high) - place(low))) * (to - from);
-    return { at, ticks, shows: (value) => value !== null && (!log || value > 0) };
+    return { at, ticks, shows: (value) => value !== null && (!log || value >= low * 0.999) };
   }
 
   // ---- curves --------------------------------------------------------------------------------------------

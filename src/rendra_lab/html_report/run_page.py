@@ -251,9 +251,10 @@ def _settings(settings: Settings) -> Markup:
     if told:
         parts.append(table(head, [_setting(row) for row in told], "settings"))
     elif not settings.note:
-        parts.append(tag("p", "Every setting is the default of the task."))
+        parts.append(tag("p", "The command changed nothing: the defaults of the task."))
     if settings.implied:
-        summary = tag("summary", f"{len(settings.implied)} more that follow from these choices")
+        words = "follow from these choices" if told else "differ, as the defaults have changed since"
+        summary = tag("summary", f"{len(settings.implied)} more that {words}")
         parts.append(tag("details", summary, table(head, [_setting(row) for row in settings.implied], "settings")))
     if settings.text:
         parts.append(tag("details", tag("summary", "The whole configuration"), tag("pre", settings.text)))

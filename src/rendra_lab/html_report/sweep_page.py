@@ -20,7 +20,7 @@ Row = dict[str, Any]
 _FRAME_BYTES = 200_000  # of a page without its contents
 _MOST_PICTURES = 12
 _MOST_CURVES = 40  # runs in one chart
-_RAMP = ((126, 76, 168), (72, 103, 170), (33, 145, 140), (94, 201, 98), (230, 200, 40))  # worst to best
+_RAMP = ((126, 76, 168), (72, 103, 170), (33, 145, 140), (84, 178, 84), (205, 160, 20))  # worst to best
 
 
 def sweep_page(folder: Path, max_bytes: int) -> str:
@@ -90,7 +90,14 @@ def _table(
     lines = []
     for row, job in zip(rows, jobs, strict=True):
         swatch = tag("span", class_="swatch", data_color=job["color"])
-        first = tag("td", swatch, _link(folder, row, job["label"]), data_value=row["job"], data_job=job["number"])
+        first = tag(
+            "td",
+            swatch,
+            _link(folder, row, job["label"]),
+            class_="first",
+            data_value=row["job"],
+            data_job=job["number"],
+        )
         settings = [tag("td", tag("code", row["settings"].get(key, "-"))) for key in varied]
         values = [
             tag("td", format_number(row["metrics"].get(name)), class_="num aim" if name == aim else "num",
