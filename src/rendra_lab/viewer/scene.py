@@ -305,11 +305,13 @@ def _three_channels(colors: np.ndarray) -> np.ndarray:
 
 
 def _bounds(points: np.ndarray, faces: np.ndarray | None = None) -> dict[str, Any]:
-    """The box of what is drawn: of a mesh the corners of its faces."""
+    """The box of what is drawn, of a mesh the corners of its faces, and how far from the box's middle it reaches."""
     used = points if faces is None else points[np.unique(faces)]
     if not len(used):
-        return {"bounds": None}
-    return {"bounds": [used.min(axis=0).tolist(), used.max(axis=0).tolist()]}
+        return {"bounds": None, "reach": 0.0}
+    low, high = used.min(axis=0).astype(np.float64), used.max(axis=0).astype(np.float64)
+    reach = np.linalg.norm(used - (low + high) / 2.0, axis=1).max()
+    return {"bounds": [low.tolist(), high.tolist()], "reach": float(reach)}
 
 
 def _diagonal(items: list[dict[str, Any]]) -> float:

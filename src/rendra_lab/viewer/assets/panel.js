@@ -5,7 +5,7 @@ const AXIS_COLORS = [[0.86, 0.22, 0.2], [0.2, 0.62, 0.24], [0.2, 0.4, 0.9]];
 const KEYS = [
   ["drag", "turn"], ["right drag, shift + drag", "shift"], ["wheel, pinch", "zoom"],
   ["double click", "look at this place"], ["R", "first view"], ["E", "edges"], ["F", "faces"], ["S", "flat or smooth"],
-  ["N", "normals"], ["L", "next look"], ["G", "grid"], ["U", "y or z up"], ["B", "background"],
+  ["N", "normals"], ["L", "next look"], ["G", "grid"], ["A", "axes"], ["U", "y or z up"], ["B", "background"],
   ["+ −", "zoom"], ["arrows", "turn, with shift shift"], ["Esc", "give the wheel back to the page"],
 ];
 

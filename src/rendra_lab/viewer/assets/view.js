@@ -23,7 +23,6 @@ class View {
   reset(target, radius) {
     this.target = target;
     this.radius = radius > 0 ? radius : 1;
-    this.home = null;
     Object.assign(this, this.start);
     this.fit();
   }
@@ -80,6 +79,13 @@ class View {
 
   zoom(factor) {
     this.distance = clamp(this.distance * factor, this.radius * 1e-3, this.radius * 100);
+  }
+
+  // Turn around another place from now on; the eye moves sideways alone, so that nothing grows or shrinks.
+  lookAt(place) {
+    this.distance = dot(subtract(this.eye(), place), this.axes().back);
+    this.target = place;
+    this.zoom(1);
   }
 
   // The place at a depth of the window (x and y from -1 to 1, depth from 0 to 1).

@@ -40,15 +40,17 @@ class Scene {
     this.measure();
   }
 
+  // The box around what is visible, and the radius around its middle.
   measure() {
     this.version++;
-    const boxes = this.items.filter((item) => item.bounds && item.visible).map((item) => this.placed(item));
-    const all = boxes.length ? boxes : this.items.filter((item) => item.bounds).map((item) => this.placed(item));
-    this.box = boxAround(all);
+    const there = this.items.filter((item) => item.bounds);
+    const shown = there.some((item) => item.visible) ? there.filter((item) => item.visible) : there;
+    this.box = boxAround(shown.map((item) => this.placed(item)));
     const [low, high] = this.box || [[-1, -1, -1], [1, 1, 1]];
     this.center = scaled(add(low, high), 0.5);
-    this.radius = size(subtract(high, low)) / 2 || 1;
-    this.reach = size(this.center) + 2.5 * this.radius;
+    const reaches = shown.map((item) => size(subtract(scaled(add(...this.placed(item)), 0.5), this.center)) + item.reach);
+    this.radius = Math.min(size(subtract(high, low)) / 2, Math.max(0, ...reaches)) || 1;
+    this.reach = size(this.center) + 3 * this.radius;
   }
 
   placed(item) {
@@ -144,6 +146,7 @@ class Viewer {
       n: () => this.set("look", state.look === 3 ? 0 : 3),
       l: () => this.set("look", (state.look + 1) % LOOKS.length),
       g: () => this.set("grid", !state.grid),
+      a: () => this.set("axes", !state.axes),
       u: () => this.set("up", state.up === "y" ? "z" : "y"),
       b: () => this.set("background", next(Object.keys(BACKGROUNDS), state.background)),
     };
@@ -157,7 +160,7 @@ class Viewer {
     if (!this.drawing) return;
     const [column, row] = [Math.floor(x * this.canvas.width), Math.floor((1 - y) * this.canvas.height)];
     const depth = this.drawing.depthAt(this.view, this.state, column, row);
-    if (depth !== null) this.view.target = this.view.placeAt(2 * x - 1, 1 - 2 * y, depth);
+    if (depth !== null) this.view.lookAt(this.view.placeAt(2 * x - 1, 1 - 2 * y, depth));
   }
 
   savePicture() {
@@ -219,7 +222,7 @@ class Viewer {
   }
 
   prepare() {
-    if (this.gl.isContextLost()) return;
+    if (!this.gl || this.gl.isContextLost()) return;  // lost before this viewer was ever in sight
     this.panel.say(this.scene.box ? "" : this.panel.message.textContent);
     try {
       this.drawing = new Drawing(this.gl, this.scene, () => this.changed());
