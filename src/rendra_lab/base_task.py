@@ -11,10 +11,12 @@ from typing import Any, Generic, TypeVar, cast
 
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchmetrics import Metric
 
+from rendra_lab.random_state import untouched
 from rendra_lab.records import FieldError
 from rendra_lab.terms import LossTerm, MetricTerm
 
@@ -103,10 +105,9 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
     @contextmanager
     def _observed(self) -> Iterator[None]:
         modes = [(module, module.training) for module in self.modules()]
-        devices = [self.device] if self.device.type == "cuda" else []
         self.eval()
         try:
-            with torch.no_grad(), torch.random.fork_rng(devices):
+            with torch.no_grad(), untouched():
                 yield
         finally:
             for module, training in modes:
@@ -142,6 +143,7 @@ class Task(BaseTask[BatchT, PredictionT]):
             raise ValueError("a task needs an optimizer, such as optimizer=adam")
         self._make_optimizer = optimizer
         self._make_scheduler = scheduler
+        self._unfinished: dict[str, Tensor] = {}
 
     def parameter_groups(self) -> Iterable[Any]:
         """What the optimizer gets: the parameters with gradients, or `torch.optim` parameter groups."""
@@ -176,8 +178,32 @@ class Task(BaseTask[BatchT, PredictionT]):
         self.log_dict({**self.step_losses, **watched}, prog_bar=True, batch_size=1)
         return total
 
+    def finish(self) -> None:
+        """What the result still needs when the fit is over; called before it is saved and shown.
+
+        Checkpoints keep the state before it too, from which a fit goes on as if it had not ended. Nothing may change
+        the state in `on_train_batch_end`: by then callbacks have saved the step.
+        """
+
+    def on_train_epoch_end(self) -> None:
+        """Lightning's hook: finishes what is over."""
+        if type(self).finish is not Task.finish and self.trainer.fit_loop.done:
+            self._unfinished = {name: tensor.clone() for name, tensor in self.state_dict().items()}
+            self.finish()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Lightning's hook: adds the state before `finish`."""
+        if self._unfinished:
+            checkpoint["unfinished"] = self._unfinished
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Lightning's hook: a fit goes on from the state before `finish`."""
+        if "unfinished" in checkpoint and self.trainer.state.fn == TrainerFn.FITTING:
+            checkpoint["state_dict"] = checkpoint["unfinished"]
+
     def on_train_batch_start(self, batch: BatchT, batch_idx: int) -> None:
         """Lightning's hook: hands the residuals to an optimizer that declares a need for them."""
+        self._unfinished = {}
         for optimizer in self.trainer.optimizers:
             if getattr(optimizer, "needs_residuals", False):
                 optimizer.residuals = lambda: self.residuals(batch)  # type: ignore[attr-defined]

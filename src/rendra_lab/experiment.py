@@ -35,6 +35,7 @@ from rendra_lab.durable import sweep_leftovers
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
 from rendra_lab.nan_guard import NanGuard
+from rendra_lab.random_state import RandomState
 from rendra_lab.settings import check_run
 from rendra_lab.targets import check_targets
 
@@ -91,7 +92,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     task = instantiate(cfg.module, _convert_="all", **shared)
     settings: dict[str, Any] = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     if observers:
-        callbacks = _parts(cfg.callbacks)
+        callbacks = [*_parts(cfg.callbacks), RandomState()]
         for guard in (callback for callback in callbacks if isinstance(callback, NanGuard)):
             guard.config = OmegaConf.to_yaml(cfg, resolve=True)
         settings = {

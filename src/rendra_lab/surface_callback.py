@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from rendra_lab import report
@@ -14,6 +13,7 @@ from rendra_lab.data.ray_views import SceneViews
 from rendra_lab.mesh_export import SurfaceSettings, export_surface
 from rendra_lab.metrics import surface_chamfer_l1
 from rendra_lab.networks.radiance import RadianceScene
+from rendra_lab.random_state import untouched
 
 
 class SurfaceExporter(Callback):
@@ -53,7 +53,7 @@ class SurfaceExporter(Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not (trainer.is_global_zero and isinstance(data, SceneViews) and isinstance(pl_module, RadianceScene)):
             return
-        with torch.random.fork_rng([pl_module.device] if pl_module.device.type == "cuda" else []):
+        with untouched():
             written = export_surface(pl_module, self.settings, self.folder / "mesh", data.scene.up)
         report.say(str(written))
         if not written.files:

@@ -110,7 +110,7 @@ def test_a_frame_to_come_is_seen_from_the_camera_as_it_stands():
     task = PoseTrack(scene, LookAtPose(), GivenStart(), 3, losses=terms, optimizer=partial(torch.optim.SGD, lr=0.1))
     task.pose.place(data.R[:1], data.T[:1])
     torch.testing.assert_close(task.predict(data.views[2]).T, data.T[:1])
-    task.on_train_batch_end(None, data.views[0], 0)
+    task.finish()
     task.frame.fill_(1)
     task.pose.place(data.R[1:2], data.T[1:2])
     torch.testing.assert_close(task.predict(data.views[0]).T, data.T[:1])  # finished: from its own pose

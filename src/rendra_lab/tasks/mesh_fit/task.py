@@ -79,19 +79,19 @@ class MeshFit(Task[CloudBatch, SurfacePrediction]):
             self.surface.place(self.trainer.datamodule.cloud.points[0].to(self.device))  # type: ignore[attr-defined]
 
     def on_train_batch_start(self, batch: CloudBatch, batch_idx: int) -> None:
-        """Lightning's hook: goes on at a finer level when it is time."""
-        level = sum(step <= self.global_step for step in self.refine_at)
-        if level > int(self.surface.level):
+        """Lightning's hook: takes back, now and then, what made the surface cross itself; refines it when it is time."""
+        step = self.global_step
+        level = sum(begin <= step for begin in self.refine_at)
+        is_coarse = level > int(self.surface.level)
+        if is_coarse or (step > 0 and step % self.check_every == 0):
             self.surface.check()
+        if is_coarse:
             self.surface.refine_to(level)
         super().on_train_batch_start(batch, batch_idx)
 
-    def on_train_batch_end(self, outputs: Any, batch: CloudBatch, batch_idx: int) -> None:
-        """Lightning's hook: takes back, now and then and after the last step, what made the surface cross itself."""
-        # not in on_train_end: by then callbacks have written checkpoint and meshes
-        is_last = self.trainer.should_stop or self.global_step == self.trainer.max_steps
-        if is_last or self.global_step % self.check_every == 0:
-            self.surface.check()
+    def finish(self) -> None:
+        """Takes back what made the surface cross itself since the last check."""
+        self.surface.check()
 
     def panels(self, prediction: SurfacePrediction, batch: CloudBatch) -> dict[str, Tensor]:
         """The cloud and the surface, from the front and from the side."""

@@ -62,6 +62,7 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
     def on_train_batch_start(self, batch: ViewBatch, batch_idx: int) -> None:
         """Lightning's hook: a new frame starts from the pose of the last."""
         if int(batch.frame) != int(self.frame):
+            self.finish()
             self.pose.place(*(x.detach() for x in self.pose()))
             self.frame.fill_(int(batch.frame))
             for optimizer in self.trainer.optimizers:
@@ -69,11 +70,11 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
                 optimizer.state = defaultdict(dict)
         super().on_train_batch_start(batch, batch_idx)
 
-    def on_train_batch_end(self, outputs: Any, batch: ViewBatch, batch_idx: int) -> None:
-        """Lightning's hook: notes the frame's pose."""
+    def finish(self) -> None:
+        """Notes the pose of the frame in work."""
         R, T = self.pose()
-        self.track_R[int(batch.frame)] = R[0].detach()
-        self.track_T[int(batch.frame)] = T[0].detach()
+        self.track_R[int(self.frame)] = R[0].detach()
+        self.track_T[int(self.frame)] = T[0].detach()
 
     def panels(self, prediction: PosePrediction, batch: ViewBatch) -> dict[str, Tensor]:
         """Target, fit, and where the two outlines differ."""
