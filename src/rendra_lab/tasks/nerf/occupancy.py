@@ -17,6 +17,7 @@ from rendra_lab.data.ray_views import Scene
 from rendra_lab.data.scene_box import carve, cells_along
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.networks.sizes import take_sizes
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 
@@ -118,8 +119,8 @@ class OccupancyRenderer(RayRenderer):
         self.largest[self.hull] = torch.maximum(found, self.decay * largest)
         self.usual[self.hull] = torch.lerp(found, usual, self.decay) if step > self.refresh_every else found
         if step >= self.empty_from:
-            self.solid = (self.largest > self.empty_below) & self.hull
-            self.occupied = dilate(self.solid) & self.hull
+            self.solid.copy_((self.largest > self.empty_below) & self.hull)  # in place: processes share it
+            self.occupied.copy_(dilate(self.solid) & self.hull)
 
     @property
     def step_length(self) -> float:
@@ -173,9 +174,7 @@ class OccupancyRenderer(RayRenderer):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""
-        for name in ("occupied", "solid", "hull", "largest", "usual"):
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.hull.device))
+        take_sizes(self.named_buffers(recurse=False), state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     @staticmethod

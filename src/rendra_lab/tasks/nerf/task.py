@@ -43,8 +43,10 @@ class NeRF(Task[RayBatch, RadiancePrediction]):
         """What the rays of a batch see."""
         return mean_over_rays(self.renderer(Rays.of(batch)), batch)
 
-    def on_fit_start(self) -> None:
-        """Lightning's hook: says where the scene lies, unless a checkpoint did."""
+    def setup(self, stage: str) -> None:
+        """Lightning's hook: says where the scene lies, before a checkpoint may and processes agree on sizes."""
+        if stage != "fit":
+            return
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, SceneViews)
         self.renderer.place(data.scene)

@@ -19,6 +19,7 @@ from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene, within_box
 from rendra_lab.data.scene_box import carve, cells_along
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
+from rendra_lab.networks.sizes import take_sizes
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
 _SHORTEST = 1e-9  # step of a ray without length, as a share of others
@@ -114,9 +115,7 @@ class VolumeGrid(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the sizes that a checkpoint has."""
-        for name, tensor in (*self.grids.named_parameters(prefix="grids"), ("occupied", self.occupied)):
-            if prefix + name in state_dict:
-                tensor.data = state_dict[prefix + name].to(tensor.device).clone()
+        take_sizes((*self.grids.named_parameters(prefix="grids"), ("occupied", self.occupied)), state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property

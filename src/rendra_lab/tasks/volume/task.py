@@ -74,8 +74,10 @@ class Volume(Task[RayBatch, VolumePrediction]):
             return self.smooth_every * self.volume.roughness()
         return self.volume.box.new_zeros(())
 
-    def on_fit_start(self) -> None:
-        """Lightning's hook: lays the voxels into the scene, unless a checkpoint did."""
+    def setup(self, stage: str) -> None:
+        """Lightning's hook: lays the voxels into the scene, before a checkpoint may and processes agree on sizes."""
+        if stage != "fit":
+            return
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, SceneViews)
         if not bool(self.volume.is_placed):
