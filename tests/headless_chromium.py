@@ -27,7 +27,12 @@ _DRIVER = "GL Driver Message"  # about the speed of reading a picture back: the 
 
 
 def seen(
-    page: str, folder: Path, size: tuple[int, int] = (800, 600), budget_ms: int = 3000, webgl: bool = True
+    page: str,
+    folder: Path,
+    size: tuple[int, int] = (800, 600),
+    budget_ms: int = 8000,
+    webgl: bool = True,
+    fragment: str = "",
 ) -> tuple[np.ndarray, list[str]]:
     """A screenshot (H, W, 3) in 0 to 255 of HTML text, and the lines of its console.
 
@@ -39,6 +44,7 @@ def seen(
         size: width and height of the window.
         budget_ms: how long the page lives, in its own clock.
         webgl: whether the browser has it.
+        fragment: of the page's address, such as `#step=3`.
     """
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
@@ -53,7 +59,7 @@ def seen(
         *own,
         *(_WITH_WEBGL if webgl else _WITHOUT_WEBGL),
         f"--screenshot={picture}",
-        source.as_uri(),
+        source.as_uri() + fragment,
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     said = re.findall(r":CONSOLE:\d+\] \"(.*)\", source: ", done.stderr)
