@@ -63,6 +63,8 @@ class ToyTask(Task[ToyBatch, ToyPrediction]):
 class ToyData(LightningDataModule):
     """One image, repeated."""
 
+    is_divisible = True  # all processes see the same
+
     def __init__(self, steps: int = 1000, size_px: int = 16) -> None:
         super().__init__()
         self.steps = steps

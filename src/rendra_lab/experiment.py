@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import json
 import logging
-import os
-import subprocess
 import sys
 import time
 import warnings
@@ -18,13 +14,11 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.model_helpers import is_overridden
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
-from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf import DictConfig, OmegaConf
 
 from rendra_lab import html_report, interruptions, report, signals
 from rendra_lab.base_task import BaseTask
@@ -33,10 +27,11 @@ from rendra_lab.checkpoint_io import SafeCheckpointIO, describe
 from rendra_lab.checkpoints import checkpoints_are_data, find_checkpoint, must_fit, read_weights
 from rendra_lab.durable import sweep_leftovers
 from rendra_lab.errors import UserError
-from rendra_lab.loggers import TensorBoard
+from rendra_lab.loggers import LogKeeper, TensorBoard
 from rendra_lab.nan_guard import NanGuard
+from rendra_lab.processes import check_divisible, is_first_process, own_processes
 from rendra_lab.random_state import RandomState
-from rendra_lab.settings import check_run
+from rendra_lab.settings import check_run, rehearse
 from rendra_lab.targets import check_targets
 
 log = logging.getLogger(__name__)
@@ -54,6 +49,16 @@ _IDLE_WARNINGS = (
     r".*LeafSpec.*is deprecated.*",
     r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint.*",
 )
+
+# A trainer that writes nothing and starts no other processes.
+_ALONE = {
+    "logger": False,
+    "enable_checkpointing": False,
+    "enable_progress_bar": False,
+    "strategy": "auto",
+    "devices": 1,
+    "num_nodes": 1,
+}
 
 
 @dataclass
@@ -89,10 +94,11 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     seed_everything(_seed(cfg), workers=True, verbose=False)
     shared = {} if cfg.scene is None else {"scene": instantiate(cfg.scene, _convert_="all")}
     data = instantiate(cfg.data, _convert_="all", **shared)
+    rehearse(*(instantiate(part, _convert_="all") for part in (cfg.optimizer, cfg.scheduler)))
     task = instantiate(cfg.module, _convert_="all", **shared)
-    settings: dict[str, Any] = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    settings: dict[str, Any] = dict(_ALONE)
     if observers:
-        callbacks = [*_parts(cfg.callbacks), RandomState()]
+        callbacks = [LogKeeper(), *_parts(cfg.callbacks), RandomState()]
         for guard in (callback for callback in callbacks if isinstance(callback, NanGuard)):
             guard.config = OmegaConf.to_yaml(cfg, resolve=True)
         settings = {
@@ -123,14 +129,15 @@ def _run(cfg: DictConfig) -> float | None:
     experiment = None
     try:
         experiment = build(cfg)
+        check_divisible(experiment.trainer, experiment.data)
         wanted = cfg.ckpt_path or interruptions.requeued_from(Path(cfg.output_root), record["overrides"])
         checkpoint = find_checkpoint(wanted, folder, Path(cfg.output_root), cfg.module.get("_target_"))
-        if _is_first_process():
+        if is_first_process():
             for place in {folder / "checkpoints", checkpoint.parent if checkpoint else folder}:
                 sweep_leftovers(place)
         clock.lap("setup")
         record["resumed_from"] = None if checkpoint is None else str(checkpoint)
-        with _own_processes(experiment):
+        with own_processes(experiment.trainer, folder):
             record["metrics"] = _fit_and_test(experiment, checkpoint, clock)
     except BaseException as error:
         record["steps"] = 0 if experiment is None else experiment.trainer.global_step
@@ -157,7 +164,7 @@ def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, erro
         seconds=clock.laps(),
     )
     folder = Path(cfg.run_dir)
-    if _is_first_process():
+    if is_first_process():
         try:
             report.write_json(folder / "metrics.json", record)
         except OSError as problem:  # the disk that ended the run
@@ -165,7 +172,7 @@ def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, erro
         html_report.leave_run_report(folder, cfg.report)
     if number is None:
         return
-    if _is_first_process():
+    if is_first_process():
         line = interruptions.farewell(number, folder, record["steps"], Path(cfg.output_root), record["overrides"])
         sys.stderr.write(f"{line}\n")
     raise SystemExit(128 + number) from None
@@ -241,49 +248,6 @@ def _fit_and_test(experiment: Experiment, checkpoint: Path | None, clock: _Clock
     return metrics
 
 
-@contextlib.contextmanager
-def _own_processes(experiment: Experiment) -> Iterator[None]:
-    """Distributed processes of one run begin and end with it.
-
-    Lightning starts them with this process's command line. In a sweep that would repeat the whole sweep in each
-    of them; here they get the command of the one job, and its folder.
-    """
-    known = HydraConfig.get() if HydraConfig.initialized() else None
-    arguments, environment = sys.argv, dict(os.environ)
-    if known is not None and known.mode == RunMode.MULTIRUN:
-        hydra_own = [item for item in known.overrides.hydra if not item.startswith("hydra.mode=")]
-        resumed = [] if experiment.cfg.ckpt_path is None else [f"ckpt_path={json.dumps(experiment.cfg.ckpt_path)}"]
-        sys.argv = [arguments[0], *known.overrides.task, *resumed, *hydra_own]
-        with read_write(known):  # type: ignore[arg-type]
-            known.run.dir = str(experiment.folder)
-    try:
-        yield
-    finally:
-        sys.argv = arguments
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
-        for process in getattr(experiment.trainer.strategy.launcher, "procs", []):
-            _end_process(process)
-        for name in ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE"):
-            os.environ.pop(name, None)
-            if name in environment:
-                os.environ[name] = environment[name]
-
-
-def _end_process(process: subprocess.Popen) -> None:
-    """Waits for a process of a run that is over; then nobody may judge it by its exit code any more.
-
-    Lightning watches that code every five seconds and kills this process too when it is not 0, in the middle of
-    the next job of a sweep.
-    """
-    for end in (lambda: None, process.terminate, process.kill):
-        end()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=10)
-            break
-    process.returncode = 0
-
-
 def _best_checkpoint(trainer: Trainer) -> str:
     for keeper in trainer.checkpoint_callbacks:
         if isinstance(keeper, ModelCheckpoint) and keeper.monitor and keeper.best_model_path:
@@ -341,7 +305,8 @@ def _commit() -> str | None:
 def _conclude(experiment: Experiment, record: dict[str, Any]) -> None:
     for logger in experiment.trainer.loggers:
         if isinstance(logger, TensorBoard):
-            logger.log_hyperparams(hyperparameters(experiment.cfg), record["metrics"])
+            name = " ".join([record["task"], *record["overrides"], f"({experiment.folder.name})"])
+            logger.log_hyperparams(hyperparameters(experiment.cfg), name=name)
             logger.close()
     report.write_json(experiment.folder / "metrics.json", record)
     page = html_report.leave_run_report(experiment.folder, experiment.cfg.report)
@@ -403,10 +368,6 @@ def _is_progress(callback: Any) -> bool:
     from lightning.pytorch.callbacks import ProgressBar
 
     return isinstance(callback, ProgressBar)
-
-
-def _is_first_process() -> bool:
-    return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _seed(cfg: DictConfig) -> int:

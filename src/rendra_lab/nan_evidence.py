@@ -31,14 +31,14 @@ _BATCH, _RANDOM, _README = "batch.pt", "random_state.pt", "README.txt"
 _RECORD = "record"  # the key under which a record's class stands among its fields
 
 
-class _NotPlain(Exception):
+class _NotPlainError(Exception):
     """A batch holds something that a file without code cannot."""
 
 
 def random_state(device: torch.device) -> dict[str, Any]:
     """The state of all generators, as tensors and plain values."""
     version, words, gauss = random.getstate()
-    numpy_state = np.random.get_state()  # noqa: NPY002 - the generator that other code draws from
+    numpy_state: Any = np.random.get_state()  # noqa: NPY002 - the generator that other code draws from
     state: dict[str, Any] = {
         "python": (version, torch.tensor(words), gauss),
         "numpy": (torch.from_numpy(numpy_state[1].astype(np.int64)), *numpy_state[2:]),
@@ -87,7 +87,7 @@ def write(
         plain = _plain(batch)
         kept = sum(each.numel() * each.element_size() for each in _tensors(plain)) <= max_bytes
         reason = f"is larger than {max_bytes / 1e6:g} MB"
-    except _NotPlain as error:
+    except _NotPlainError as error:
         kept, reason = False, str(error)
     if kept:
         torch.save(plain, folder / _BATCH)
@@ -164,7 +164,7 @@ def _plain(value: Any) -> Any:
         return type(value)(_plain(item) for item in value)
     if value is None or isinstance(value, str | int | float | bool):
         return value
-    raise _NotPlain(f"holds {type(value).__name__}")
+    raise _NotPlainError(f"holds {type(value).__name__}")
 
 
 def _tensors(plain: Any) -> Iterator[Tensor]:

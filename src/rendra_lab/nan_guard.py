@@ -15,7 +15,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
@@ -136,7 +135,7 @@ class NanGuard(Callback):
         self._in_a_row += 1
         if self._in_a_row >= self.patience:
             raise NotFiniteError(f"{words}, the last of {self._in_a_row} in a row{where}")
-        if rank_zero_only.rank == 0:
+        if trainer.is_global_zero:
             log.warning("%s: left out%s", words, where)
         for group in optimizer.param_groups:
             for parameter in group["params"]:

@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from rendra.structures import Meshes
 from rendra_lab.data.posed_images import PosedImages
+from rendra_lab.data.shares import Share
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
 
@@ -93,7 +94,12 @@ class RayCaster:
         self.side = side
 
     def pixels(
-        self, images: PosedImages, chosen: Tensor, generator: torch.Generator | None = None, jitter: bool = False
+        self,
+        images: PosedImages,
+        chosen: Tensor,
+        generator: torch.Generator | None = None,
+        jitter: bool = False,
+        share: Share = Share(),  # noqa: B008 - frozen
     ) -> RayBatch:
         """Chosen pixels (R,), counted through all images.
 
@@ -102,12 +108,15 @@ class RayCaster:
             chosen: (R,) int64.
             generator: of random backgrounds and jitter; None uses white instead of random backgrounds.
             jitter: move each ray to a random place of its part of the pixel.
+            share: of the chosen pixels; whoever takes it, a pixel gets the same random numbers.
         """
+        offsets = self._offsets(len(chosen), generator if jitter else None)[share.rows]
+        behind = self._behind(len(chosen), generator)[share.rows]
+        chosen = chosen[share.rows].contiguous()
         view = torch.searchsorted(images.first_pixel, chosen, right=True) - 1
         place = chosen - images.first_pixel[view]
-        origins, directions = self._rays(images, view, place, generator if jitter else None)
+        origins, directions = self._rays(images, view, place, offsets)
         rgba = images.pixels.index_select(0, chosen).float() / 255
-        behind = self._behind(len(chosen), generator)
         return self._batch(rgba, images.has_alpha, behind, origins, directions)
 
     def view(self, images: PosedImages, index: int) -> RayBatch:
@@ -118,26 +127,26 @@ class RayCaster:
     def blank_view(self, cameras: PosedImages, index: int) -> RayBatch:
         """All pixels of a camera that took no image, (1, H, W): nothing but background before its rays."""
         place = torch.arange(int(cameras.sizes[index].prod()))
-        origins, directions = self._rays(cameras, torch.full_like(place, index), place, None)
+        origins, directions = self._rays(
+            cameras, torch.full_like(place, index), place, self._offsets(len(place), None)
+        )
         flat = self._batch(torch.zeros(len(place), 4), True, self._behind(len(place), None), origins, directions)
         return _as_view(flat, cameras, index)
 
-    def _rays(
-        self, images: PosedImages, view: Tensor, place: Tensor, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def _rays(self, images: PosedImages, view: Tensor, place: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and directions (R * K, 3) through pixels, each counted row by row within its image."""
         width = images.sizes[view, 1]
         corner = torch.stack([place % width, place // width], dim=-1).float()
-        xy = (corner[:, None] + self._offsets(len(place), generator)).reshape(-1, 2)
+        xy = (corner[:, None] + offsets).reshape(-1, 2)
         rays = images.rays(view.repeat_interleave(self.side**2), xy)
         return rays if self.warp is None else self.warp(*rays)
 
     def _offsets(self, count: int, generator: torch.Generator | None) -> Tensor:
-        """Where in its pixel each ray goes through: (count or 1, K, 2)."""
+        """Where in its pixel each ray goes through: (count, K, 2)."""
         cells = torch.arange(self.side)
         grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2).float()
         if generator is None:
-            return (grid + 0.5) / self.side
+            return ((grid + 0.5) / self.side).expand(count, -1, -1)
         return (grid + torch.rand(count, self.side**2, 2, generator=generator)) / self.side
 
     def _behind(self, count: int, generator: torch.Generator | None) -> Tensor:
@@ -169,7 +178,8 @@ def _as_view(flat: RayBatch, images: PosedImages, index: int) -> RayBatch:
 class RandomPixels:
     """Endless random pixels of the training images; one pass is one epoch of `steps` batches.
 
-    The random numbers of a step follow from seed and step alone, so a resumed run sees what it would have seen.
+    The random numbers of a step follow from seed and step alone, so a resumed run sees what it would have seen, and
+    processes that divide a step see together what one alone would.
     """
 
     def __init__(
@@ -181,6 +191,7 @@ class RandomPixels:
         self.precrop: float = how["precrop"]
         self.precrop_steps: int = how["precrop_steps"]
         self.jitter: bool = how["jitter"]
+        self.share: Share = how.get("share", Share())
         self.focus: float = how["focus"] if images.has_alpha and self.views_per_step is None else 0.0
         self._near = pixels_near_matter(images) if self.focus > 0 else torch.zeros(0, dtype=torch.int32)
         self._next = 0
@@ -207,7 +218,7 @@ class RandomPixels:
         generator = torch.Generator().manual_seed(int(mixed[0]))
         caster = self.casters(step)
         chosen = self._chosen(step, max(1, self.num_rays // caster.side**2), generator)
-        return caster.pixels(self.images, chosen, generator, self.jitter)
+        return caster.pixels(self.images, chosen, generator, self.jitter, self.share)
 
     def _chosen(self, step: int, count: int, generator: torch.Generator) -> Tensor:
         views = torch.arange(len(self.images))
@@ -238,21 +249,25 @@ def pixels_near_matter(images: PosedImages) -> Tensor:
 
 
 class WholeViews:
-    """Every pixel of every image, one image a batch."""
+    """Every pixel of every image, one image a batch; or of a share of the images."""
 
-    def __init__(self, caster: RayCaster, images: PosedImages) -> None:
+    def __init__(self, caster: RayCaster, images: PosedImages, share: Share = Share()) -> None:  # noqa: B008 - frozen
         self.caster, self.images = caster, images
+        self.indices = range(len(images))[share.whole_if_few(len(images)).rows]
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.indices)
 
     def __iter__(self) -> Iterator[RayBatch]:
-        for index in range(len(self.images)):
+        for index in self.indices:
             yield self.caster.view(self.images, index)
 
 
 class SceneViews(LightningDataModule, ABC):
     """Views of one scene; subclasses say where they come from.
+
+    Several processes divide the pixels of a step and the views of a validation among them; each of them sees the
+    whole test, whose numbers, pictures and order are therefore those of one process.
 
     Args:
         rays_per_step: rays of a training step, of all of its pixels.
@@ -307,6 +322,8 @@ class SceneViews(LightningDataModule, ABC):
             "focus": focus,
         }
 
+    is_divisible = True
+
     @abstractmethod
     def load(self) -> Scene:
         """The views; UserError names the file and what is wrong with it."""
@@ -340,11 +357,12 @@ class SceneViews(LightningDataModule, ABC):
         def casters(step: int) -> RayCaster:
             return self._caster([side for begin, side in self.sides if begin <= step][-1])
 
-        return RandomPixels(casters, self.scene.train, self.rays_per_step, self.steps, self.seed, **self.how)
+        how = {**self.how, "share": Share.of(self)}
+        return RandomPixels(casters, self.scene.train, self.rays_per_step, self.steps, self.seed, **how)
 
     def val_dataloader(self) -> WholeViews | Sequence[RayBatch]:
         """The validation images, one a batch."""
-        return WholeViews(self.caster, self.scene.val)
+        return WholeViews(self.caster, self.scene.val, Share.of(self))
 
     def test_dataloader(self) -> WholeViews:
         """The test images, one a batch."""

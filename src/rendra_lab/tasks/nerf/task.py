@@ -12,9 +12,9 @@ from typing import Any
 from torch import Tensor
 
 from rendra_lab.base_task import Task
-from rendra_lab.data.ray_views import RayBatch, SceneViews
+from rendra_lab.data.ray_views import RayBatch
 from rendra_lab.errors import UserError
-from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, view_panels
+from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, scene_of, view_panels
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 from rendra_lab.tasks.nerf.samplers import HierarchicalRenderer
 
@@ -47,9 +47,7 @@ class NeRF(Task[RayBatch, RadiancePrediction]):
         """Lightning's hook: says where the scene lies, before a checkpoint may and processes agree on sizes."""
         if stage != "fit":
             return
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(data, SceneViews)
-        self.renderer.place(data.scene)
+        self.renderer.place(scene_of(self))
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         """Lightning's hook: lets the renderer learn where there is nothing."""

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rendra_lab.base_task import Task
-from rendra_lab.data.ray_views import RayBatch, SceneViews
-from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, view_panels
+from rendra_lab.data.ray_views import RayBatch
+from rendra_lab.networks.radiance import RadiancePrediction, Rays, mean_over_rays, scene_of, view_panels
 from rendra_lab.tasks.volume.book import BookVolume
 from rendra_lab.tasks.volume.grid import VolumeGrid
 
@@ -78,10 +78,8 @@ class Volume(Task[RayBatch, VolumePrediction]):
         """Lightning's hook: lays the voxels into the scene, before a checkpoint may and processes agree on sizes."""
         if stage != "fit":
             return
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(data, SceneViews)
         if not bool(self.volume.is_placed):
-            self.volume.place(data.scene)
+            self.volume.place(scene_of(self))
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         """Lightning's hook: goes on at a finer level when it is time, and looks for empty space."""
