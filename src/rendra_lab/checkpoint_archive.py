@@ -1,27 +1,30 @@
-"""Reading a checkpoint that anyone may have written: first what it claims, then, if that is sound, its tensors.
+"""The file of a checkpoint: written whole or not at all, and read as if anyone had written it.
 
-A checkpoint is a zip archive of plain members: `data.pkl`, which describes a tree of values, and one member for the
-bytes of each tensor. Nothing is allocated on the word of a header: members are uncompressed and together no larger
-than the file, every tensor lies inside its member, and each member has its checksum. The description is walked by an
+It is a zip archive of plain members: `data.pkl`, which describes a tree of values, and one member for the bytes of
+each tensor. Nothing is allocated on the word of a header: members are uncompressed and together no larger than the
+file, every tensor lies inside its member, and each member has its checksum. The description is walked by an
 unpickler that can build plain values and names of tensors, and calls nothing that the file asks for.
 """
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 import pickle
+import struct
 import zipfile
 from _compat_pickle import IMPORT_MAPPING, NAME_MAPPING
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import torch
 
 from rendra_lab import report
+from rendra_lab.durable import write_durably
 from rendra_lab.errors import UserError
 
 FORMAT = 1  # of what stands under KEY; a newer one is refused
@@ -30,6 +33,18 @@ KEY = "rendra_lab"
 _LARGEST_DESCRIPTION = 1 << 24  # bytes of data.pkl; a list in it takes a byte there and fifty in memory
 _LARGEST_VIEW = 1 << 24  # elements of a tensor that repeats a smaller storage
 _CHUNK = 1 << 20
+_SENSELESS = (
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+    AssertionError,
+    RuntimeError,
+    struct.error,
+    pickle.UnpicklingError,
+)
 _ITEM_BYTES = {
     "BFloat16Storage": 2,
     "BoolStorage": 1,
@@ -97,6 +112,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             raise CheckpointError(path, f"cannot be read: {str(error).splitlines()[0]}") from error
 
 
+def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
+    """Replaces a checkpoint by a new one, which is forced to the disk and proven first.
+
+    Raises what `durable.write_durably` does, and CheckpointError where the content is more than tensors and plain
+    values, so that no one could read it.
+    """
+    write_durably(path, lambda sink: torch.save(content, cast(IO[bytes], sink)), examine)
+
+
 def _facts(path: Path, content: Any) -> CheckpointFacts:
     if not isinstance(content, dict) or not isinstance(content.get("state_dict"), dict):
         raise CheckpointError(path, "is no checkpoint of a run: it holds no state_dict")
@@ -130,19 +154,13 @@ def _walk(path: Path, file: BinaryIO, checksums: bool) -> Any:
     except zipfile.BadZipFile as error:
         what = "is cut off, or is no checkpoint" if "not a zip" in str(error) else f"is damaged: {error}"
         raise CheckpointError(path, what) from error
-    except (
-        EOFError,
-        LookupError,
-        TypeError,
-        ValueError,
-        NotImplementedError,
-        AttributeError,
-        OverflowError,
-    ) as error:
+    except _SENSELESS as error:
         words = " ".join(str(error).split()) or type(error).__name__
         raise CheckpointError(path, f"is damaged: its description makes no sense ({words})") from error
-    except (pickle.UnpicklingError, AssertionError, RuntimeError) as error:
-        raise CheckpointError(path, f"is damaged: its description makes no sense ({error})") from error
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # that of a place outside of the file
+            raise
+        raise CheckpointError(path, "is damaged: it refers to places outside of itself") from error
 
 
 def _members(path: Path, archive: zipfile.ZipFile, size: int) -> tuple[dict[str, int], str]:
@@ -151,6 +169,10 @@ def _members(path: Path, archive: zipfile.ZipFile, size: int) -> tuple[dict[str,
     for member in members:
         if member.compress_type != zipfile.ZIP_STORED or member.compress_size != member.file_size:
             raise CheckpointError(path, f"is refused: {member.filename} is compressed, which no checkpoint is")
+        if member.external_attr & 0xFFFF or member.volume:  # torch skips a "folder" and leaves its tensor unset
+            raise CheckpointError(path, f"is damaged: {member.filename} is marked as a folder, or of another volume")
+        if not 0 <= member.header_offset < size:
+            raise CheckpointError(path, f"is damaged: {member.filename} would lie outside of it")
     claimed = sum(member.file_size for member in members)
     if claimed > size:
         raise CheckpointError(path, f"is refused: its members claim {claimed:,} bytes, the file has {size:,}")
@@ -176,7 +198,7 @@ def _fits_its_sum(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bool:
         with archive.open(member) as content:
             while content.read(_CHUNK):
                 pass
-    except (zipfile.BadZipFile, EOFError, RuntimeError):
+    except (zipfile.BadZipFile, EOFError, RuntimeError, ValueError, struct.error):
         return False
     return True
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
-import torch
 from lightning.fabric.plugins.io.checkpoint_io import CheckpointIO
 from lightning.pytorch import Trainer
 from torch import Tensor
 
 from rendra_lab import report
-from rendra_lab.checkpoint_archive import FORMAT, KEY, CheckpointError, examine, read_checkpoint
+from rendra_lab.checkpoint_archive import FORMAT, KEY, CheckpointError, read_checkpoint, write_checkpoint
 from rendra_lab.checkpoints import last_good
-from rendra_lab.durable import write_durably
 from rendra_lab.weights_file import write_weights_file
 
 
@@ -45,10 +43,9 @@ class SafeCheckpointIO(CheckpointIO):
         """
         if storage_options is not None:
             raise TypeError("a checkpoint on a local disk has no storage_options")
-        content = {**checkpoint, KEY: self.metadata}
         path = Path(path)
         try:
-            write_durably(path, lambda sink: torch.save(content, cast(IO[bytes], sink)), examine)
+            write_checkpoint(path, {**checkpoint, KEY: self.metadata})
         except (OSError, CheckpointError) as error:
             raise _failed("save", path, error) from error
 
