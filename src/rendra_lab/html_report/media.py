@@ -111,7 +111,7 @@ def still_figure(frame: Frame, room: Room, title: str) -> Markup | None:
     if not room.take(len(address), frame.path.name):
         return None
     words = frame.caption if frame.caption.startswith(title) else f"{title}: {frame.caption}"
-    picture = tag("img", src=address, alt=words, loading="lazy")
+    picture = tag("img", src=address, alt=words, decoding="async")
     return tag("figure", picture, tag("figcaption", frame.caption), data_step=frame.step)
 
 

@@ -281,8 +281,9 @@
       const low = Math.min(...present);
       const high = Math.max(...present);
       const scale = valueScale(values, low > 0 && high / low >= 30, bottom, top);
-      const settings = [...new Set(present)];
-      const ticks = settings.length <= 6 ? settings : scale.ticks;
+      const own = [...new Set(present)].sort((a, b) => a - b);
+      const apart = own.every((value, index) => index === 0 || Math.abs(scale.at(value) - scale.at(own[index - 1])) > 12);
+      const ticks = apart && own.length <= 8 ? own : scale.ticks;
       return { name, at: (value) => (value === null ? null : scale.at(value)), ticks, words: format };
     }
     const words = [...new Set(present.map(String))].sort((a, b) => a.localeCompare(b, undefined, { numeric: true }));

@@ -27,8 +27,8 @@ STAGE_NAMES = {"train": "Training", "val": "Validation", "test": "Test", "other"
 def run_page(folder: Path, max_bytes: int) -> str:
     """The HTML of a run's report; UserError where the folder holds nothing of a run."""
     record = read_record(folder)
-    if not folder.is_dir() or not (record or (folder / ".hydra").is_dir()):
-        raise UserError(f"{folder} is not the folder of a run: it has neither metrics.json nor .hydra")
+    if not any((folder / name).exists() for name in ("metrics.json", "metrics.csv", ".hydra")):
+        raise UserError(f"{folder} is not the folder of a run: it has no metrics.json, metrics.csv or .hydra")
     settings = read_settings(folder)
     room = Room(max_bytes - _FRAME_BYTES)
     curves = [curve for curve in read_curves(folder / "metrics.csv") if curve.name != "epoch"]  # bookkeeping
@@ -84,7 +84,10 @@ def with_unit(name: str, value: Any) -> str:
 def _heading(task: str, folder: Path, record: Mapping[str, Any], settings: Settings) -> Markup:
     title = tag("h1", task, " ", tag("small", folder.name), " ", status_badge(record.get("status")))
     command = record.get("command") or " ".join(["train.py", *settings.command_words])
-    return joined([title, tag("pre", f"python {command}", class_="command")])
+    lines = [f"python {command}"]
+    if settings.command_words and {"-m", "--multirun"} & set(command.split()):
+        lines.append(f"python {command.split()[0]} {' '.join(settings.command_words)}  # this job alone")
+    return joined([title, tag("pre", "\n".join(lines), class_="command")])
 
 
 def _facts(record: Mapping[str, Any]) -> Markup:
@@ -251,7 +254,7 @@ def _settings(settings: Settings) -> Markup:
     if told:
         parts.append(table(head, [_setting(row) for row in told], "settings"))
     elif not settings.note:
-        parts.append(tag("p", "The command changed nothing: the defaults of the task."))
+        parts.append(tag("p", "Nothing that the command set differs from the defaults of the task."))
     if settings.implied:
         words = "follow from these choices" if told else "differ, as the defaults have changed since"
         summary = tag("summary", f"{len(settings.implied)} more that {words}")

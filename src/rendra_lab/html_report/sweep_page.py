@@ -84,9 +84,10 @@ def _varied(rows: list[Row]) -> list[str]:
 def _table(
     folder: Path, rows: list[Row], jobs: list[Row], varied: list[str], names: list[str], aim: str | None
 ) -> Markup:
-    numbers = [(f"{name} [{unit_of(name)}]" if unit_of(name) else name) for name in names]
+    short = [name.removeprefix("test/") for name in names]
+    numbers = [(f"{name} [{unit_of(name)}]" if unit_of(name) else name) for name in short]
     right = [tag("th", text, class_="num") for text in (*numbers, "seconds")]
-    head = ["job", *varied, *right, "status"]
+    head = ["job", "status", *varied, *right]
     lines = []
     for row, job in zip(rows, jobs, strict=True):
         swatch = tag("span", class_="swatch", data_color=job["color"])
@@ -105,7 +106,8 @@ def _table(
             for name in names
         ]  # fmt: skip
         seconds = tag("td", spoken_seconds(row["seconds"]), class_="num", data_value=_exact(row["seconds"]))
-        lines.append([first, *settings, *values, seconds, tag("td", status_badge(row["status"]), title=row["error"])])
+        status = tag("td", status_badge(row["status"]), title=row["error"])
+        lines.append([first, status, *settings, *values, seconds])
     return table(head, lines, "jobs")
 
 
