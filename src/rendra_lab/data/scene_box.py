@@ -93,7 +93,8 @@ def carve(images: PosedImages, box: Tensor, resolution: int | tuple[int, int, in
     """Which cells of a box may hold anything, judged by the silhouettes.
 
     A cell is empty only if it and all its neighbours lie fully outside the silhouette of some view that has all of
-    the cell in its picture. Images without silhouettes leave everything.
+    the cell in its picture. Images without silhouettes leave everything, and so do, with a warning, silhouettes
+    that have nothing in common.
 
     Args:
         images: of the scene.
@@ -107,6 +108,9 @@ def carve(images: PosedImages, box: Tensor, resolution: int | tuple[int, int, in
     if not has_silhouettes(images):
         return torch.ones(shape, dtype=torch.bool, device=box.device)
     kept, _ = _carved(_silhouettes(images, range(len(images))), box, shape)
+    if len(kept) == 0:
+        log.warning("the silhouettes have nothing in common, so all of the box may hold something")
+        return torch.ones(shape, dtype=torch.bool, device=box.device)
     cells = torch.zeros(math.prod(shape), device=box.device)
     cells[kept] = 1
     return F.max_pool3d(cells.reshape(1, 1, *shape), 3, stride=1, padding=1)[0, 0] > 0

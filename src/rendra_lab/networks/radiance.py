@@ -8,10 +8,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
+from lightning.pytorch import LightningModule
 from torch import Tensor
 from torch.nn import functional
 
-from rendra_lab.data.ray_views import RayBatch
+from rendra_lab.data.ray_views import RayBatch, Scene, SceneViews
+from rendra_lab.errors import UserError
 from rendra_lab.normal_maps import normals_from_depth
 from rendra_lab.records import TensorRecord
 from rendra_lab.visualization import depth_image, normal_image
@@ -84,6 +86,21 @@ class RadianceScene(Protocol):
 
     def color_at(self, points: Float[Tensor, "M 3"], directions: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
         """The light, sRGB in [0, 1], that leaves the points against rays of such unit directions."""
+
+
+def scene_of(task: LightningModule) -> Scene:
+    """The scene that a task is about to be fitted to.
+
+    Raises:
+        UserError: its data are no views of one scene.
+    """
+    data = task.trainer.datamodule  # type: ignore[attr-defined]
+    if not isinstance(data, SceneViews):
+        raise UserError(
+            f"{type(task).__name__} is fitted to posed views of one scene, and {type(data).__name__} has none: take "
+            "data=cow_views, nerf_blender, transforms, colmap or llff"
+        )
+    return data.scene
 
 
 def in_pieces(render: Callable[[Rays], RaysSeen], rays: Rays, at_once: int) -> RaysSeen:

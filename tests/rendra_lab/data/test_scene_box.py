@@ -117,6 +117,9 @@ def test_silhouettes_with_nothing_in_common_fall_back_on_the_cameras(caplog):
     box = estimate_box(views)
     assert "nothing in common" in caplog.text
     assert box[1, 0] > 1
+    caplog.clear()
+    assert carve(views, box, 16).all()  # an empty hull would never show anything
+    assert "nothing in common" in caplog.text
 
 
 def forward_facing(count=5):

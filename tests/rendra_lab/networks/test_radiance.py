@@ -1,13 +1,17 @@
 """What pixels show out of what their rays saw."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from assertions import assert_close
 from far_device import Far, far  # noqa: F401
+from lightning.pytorch import LightningModule
 from numbered_views import posed
 
 from rendra_lab.data.ray_views import RayBatch, RayCaster
-from rendra_lab.networks.radiance import RadiancePrediction, Rays, RaysSeen, mean_over_rays, view_panels
+from rendra_lab.errors import UserError
+from rendra_lab.networks.radiance import RadiancePrediction, Rays, RaysSeen, mean_over_rays, scene_of, view_panels
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
@@ -104,3 +108,10 @@ def test_views_are_shown_where_they_lie(far) -> None:  # noqa: F811
     shown = mean_over_rays(rays, whole)
     assert all(isinstance(getattr(shown, name), Far) for name in ("rgb", "opacity", "depth"))
     assert all(isinstance(panel, Far) for panel in view_panels(shown, whole).values())
+
+
+def test_data_of_another_kind_is_refused() -> None:
+    task = LightningModule()
+    task._trainer = SimpleNamespace(datamodule=object())
+    with pytest.raises(UserError, match=r"posed views of one scene, and object has none: take data=cow_views"):
+        scene_of(task)

@@ -9,6 +9,7 @@ from far_device import Far, far  # noqa: F401
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rendra_lab.errors import UserError
 from rendra_lab.networks.encodings import HashGrid, SphericalHarmonics, TriPlane
 from rendra_lab.tasks.nerf.grid_fields import GridField, _TruncatedExp, perceptron
 
@@ -172,3 +173,17 @@ def test_samples_are_asked_about_where_they_lie(far, encoding: str) -> None:  # 
     alpha, rgb = made(points, directions[:2], steps, torch.tensor([0, 1, 1, 0, 1, 0, 0, 0, 1], device=far))
     (alpha.sum() + rgb.sum()).backward()
     assert all(isinstance(parameter.grad, Far) for parameter in made.parameters())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"width": 0}, {"density_layers": -1}, {"color_layers": -1}, {"memory": -1}, {"start_density": 0.0}]
+)
+def test_fields_that_cannot_be_are_refused(wrong: dict[str, float]) -> None:
+    ((name, value),) = wrong.items()
+    with pytest.raises(UserError, match=rf"field\.{name} must be .*, got {value}"):
+        GridField(HashGrid(2, 2, 6, 4, 8), **wrong)
+
+
+def test_a_field_needs_a_light_that_depends_on_something() -> None:
+    with pytest.raises(UserError, match=r"field\.memory is 0 and field\.directions null"):
+        GridField(HashGrid(2, 2, 6, 4, 8), memory=0)

@@ -1,6 +1,8 @@
 """The grid of the task `volume`: closed forms of even matter, finer levels, empty space and checkpoints."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.data.ray_views import Scene, within_box
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays
+from rendra_lab.tasks.volume.book import BookVolume
 from rendra_lab.tasks.volume.grid import VolumeGrid, _SlabVariation
 
 CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -93,6 +97,34 @@ def test_levels_that_cannot_be_are_refused(wrong: tuple[int, ...]) -> None:
 def test_steps_and_densities_are_above_nothing(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="above 0"):
         VolumeGrid((8,), **wrong)
+
+
+@pytest.mark.parametrize("made", [lambda **how: VolumeGrid((8,), **how), lambda **how: BookVolume(8, **how)])
+def test_rays_are_rendered_one_at_a_time_or_more(made: Callable[..., nn.Module]) -> None:
+    with pytest.raises(UserError, match=r"volume\.rays_at_once must be at least 1, got 0"):
+        made(rays_at_once=0)
+
+
+@pytest.mark.parametrize("wrong", [{"empty_below": -0.1}, {"stop_below": 1.5}, {"stop_below": float("nan")}])
+def test_shares_lie_between_zero_and_one(wrong: dict[str, float]) -> None:
+    (name,) = wrong
+    with pytest.raises(UserError, match=rf"volume\.{name} is a share, in \[0, 1\], got"):
+        VolumeGrid((8,), **wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"voxels": 1}, r"volume\.voxels must be at least 2, got 1"),
+        ({"samples": 1}, r"volume\.samples must be at least 2, got 1"),
+        ({"side": 0.0}, r"volume\.side must be above 0, got 0"),
+        ({"depth_range": (3.0, 0.1)}, r"volume\.depth_range is two ascending distances.*got \[3\.0, 0\.1\]"),
+        ({"depth_range": (0.1,)}, r"volume\.depth_range is two ascending distances"),
+    ],
+)
+def test_a_book_volume_that_cannot_be_is_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        BookVolume(**wrong)
 
 
 # what rays see

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from rendra.ops.sample_pdf import sample_pdf
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
+from rendra_lab.number_checks import check_at_least
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 
@@ -117,7 +118,7 @@ class StratifiedRenderer(DenseRenderer):
 
     def __init__(self, field: RadianceField, samples: int = 128, **marching: Any) -> None:
         super().__init__(field, **marching)
-        _at_least(2, samples=samples)
+        check_at_least(2, "sampler", samples=samples)
         self.samples = samples
 
     def look(self, rays: Rays) -> RaysSeen:
@@ -145,8 +146,8 @@ class HierarchicalRenderer(DenseRenderer):
         **marching: Any,
     ) -> None:
         super().__init__(field, **marching)
-        _at_least(3, coarse_samples=coarse_samples)
-        _at_least(1, fine_samples=fine_samples)
+        check_at_least(3, "sampler", coarse_samples=coarse_samples)
+        check_at_least(1, "sampler", fine_samples=fine_samples)
         self.coarse = coarse
         self.coarse_samples = coarse_samples
         self.fine_samples = fine_samples
@@ -183,9 +184,3 @@ def composite(alpha: Tensor, rgb: Tensor, distances: Tensor) -> tuple[Tensor, Ra
     weights = alpha * F.pad(passed, (1, 0), value=1.0)
     seen = RaysSeen((weights[..., None] * rgb).sum(1), weights.sum(1), (weights * distances).sum(1))
     return weights, seen
-
-
-def _at_least(least: int, **numbers: int) -> None:
-    for name, number in numbers.items():
-        if number < least:
-            raise UserError(f"sampler.{name} must be at least {least}, got {number}")

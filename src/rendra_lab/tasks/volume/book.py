@@ -13,7 +13,9 @@ from torch.nn import functional as F
 
 from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
+from rendra_lab.number_checks import check_above_zero, check_at_least
 
 
 class BookVolume(nn.Module):
@@ -44,8 +46,13 @@ class BookVolume(nn.Module):
         rays_at_once: int = 65536,
     ) -> None:
         super().__init__()
-        if min(voxels, samples) < 2 or side <= 0 or not 0 <= depth_range[0] < depth_range[1]:
-            raise ValueError("a volume needs 2 voxels, 2 samples, a side above 0 and a rising depth_range at least")
+        check_at_least(2, "volume", voxels=voxels, samples=samples)
+        check_at_least(1, "volume", rays_at_once=rays_at_once)
+        check_above_zero("volume", side=side)
+        if len(depth_range) != 2 or not 0 <= depth_range[0] < depth_range[1]:
+            raise UserError(
+                f"volume.depth_range is two ascending distances, such as [0.1, 3.0]; got {[*depth_range]}"
+            )
         self.voxels = [voxels]
         self.samples = samples
         self.depth_range = depth_range

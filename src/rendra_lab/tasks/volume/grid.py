@@ -18,8 +18,10 @@ from torch.nn import functional as F
 from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene, within_box
 from rendra_lab.data.scene_box import carve, cells_along
+from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 from rendra_lab.networks.sizes import take_sizes
+from rendra_lab.number_checks import check_above_zero, check_at_least, check_shares
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
 _SHORTEST = 1e-9  # step of a ray without length, as a share of others
@@ -83,11 +85,12 @@ class VolumeGrid(nn.Module):
     ) -> None:
         super().__init__()
         if not voxels or min(voxels) < 2 or sorted(voxels) != list(voxels):
-            raise ValueError(
+            raise UserError(
                 f"volume.voxels are numbers of voxels, at least 2, rising from level to level, got {voxels}"
             )
-        if steps_per_voxel <= 0 or start_density <= 0:
-            raise ValueError("volume.steps_per_voxel and volume.start_density must be above 0")
+        check_above_zero("volume", steps_per_voxel=steps_per_voxel, start_density=start_density)
+        check_shares("volume", empty_below=empty_below, stop_below=stop_below)
+        check_at_least(1, "volume", rays_at_once=rays_at_once)
         self.voxels = list(voxels)
         self.steps_per_voxel = steps_per_voxel
         self.start_density = start_density
