@@ -1,7 +1,7 @@
 """Pages in a headless Chromium, drawn in software: what they look like and what they say.
 
-The browser is told what to do through two pipes (the DevTools protocol), and time is real: a page is photographed when
-it has drawn its frames, however slow the machine.
+The browser is told what to do through two pipes (the DevTools protocol), and time is real: a page is photographed
+when it has drawn its frames, however slow the machine.
 """
 
 import base64
