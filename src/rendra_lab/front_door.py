@@ -11,8 +11,9 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from hydra._internal.utils import get_args_parser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.experimental.callback import Callback
@@ -21,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rendra_lab import signals
 from rendra_lab.errors import UserError
+from rendra_lab.origins import trusted_folders, watch_origins
 from rendra_lab.sweep import conclude_sweep
 
 _EXIT_MISTAKE = 2  # the command or the configuration cannot be
@@ -46,7 +48,10 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     atexit.register(gc.freeze)  # or the interpreter's last collection walks all that was imported, for a second
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands its exceptions over instead of printing them
     FailureKeeper.active = True
+    config_dir = Path(script).resolve().parent / config_path
     try:
+        check_command_line()
+        watch_origins(config_dir)
         with signals.listening():
             main()
         if FailureKeeper.failure is not None:
@@ -61,7 +66,6 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     except Exception as error:
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
-        config_dir = Path(script).resolve().parent / config_path
         clear = isinstance(error, _MISTAKES) and not isinstance(error, InstantiationException)
         mistyped = None if verbose or clear else mistyped_value(config_dir, config_name)
         if verbose or not (mistyped or isinstance(error, _WORDED)):
@@ -90,6 +94,29 @@ class FailureKeeper(Callback):
             FailureKeeper.failure = job_return._return_value
             job_return.return_value = None
             job_return.status = JobStatus.COMPLETED
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process that a launcher starts, and that unpickles this, watches its configurations too."""
+        return _keeper_elsewhere, (trusted_folders(),)
+
+
+def _keeper_elsewhere(folders: list[Path]) -> FailureKeeper:
+    watch_origins(*folders)
+    return FailureKeeper()
+
+
+def check_command_line() -> None:
+    """Refuses flags that do not exist, and the one that reads a pickle; UserError."""
+    parser = get_args_parser()
+    parser.error = _refuse_flag  # type: ignore[method-assign,assignment]
+    if parser.parse_args().experimental_rerun is not None:
+        raise UserError("--experimental-rerun reads a pickle, which could run anything; use ckpt_path=... to go on")
+
+
+def _refuse_flag(message: str) -> NoReturn:
+    late = [item for item in sys.argv[2:] if item in ("-m", "--multirun")]
+    hint = f"{late[0]} stands before all settings" if late else "settings are key=value; see --help"
+    raise UserError(f"{message}; {hint}")
 
 
 def _is_mistake(error: Exception) -> bool:
@@ -205,6 +232,16 @@ def _plain(error: Exception) -> str:
         place = re.search(r"full_key: (\S+)", str(error))
         cause = error.__cause__ if error.__cause__ is not None else error
         words, key = " ".join(str(cause).split()), place[1] if place else "configuration"
-        return words if words.startswith(f"{key}.") else f"{key}: {words}"
+        if words.startswith(f"{key}."):
+            return words
+        return f"{key}.{words}" if _begins_with_parameter(words, str(error)) else f"{key}: {words}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if isinstance(error, HydraException) and lines else " ".join(lines) or type(error).__name__
+
+
+def _begins_with_parameter(words: str, error: str) -> bool:
+    """Whether a complaint begins with the name of what the target of an InstantiationException takes."""
+    from rendra_lab.targets import parameters_of_path
+
+    target = re.search(r"[Ee]rror in call to target '([\w.]+)'", error)
+    return target is not None and words.partition(" ")[0] in parameters_of_path(target[1])

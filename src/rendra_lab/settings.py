@@ -8,11 +8,14 @@ from __future__ import annotations
 import contextlib
 import inspect
 import math
+import re
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import torch
 
 from rendra_lab.errors import UserError
 
@@ -146,6 +149,32 @@ def check_value(value: Any, hint: Any, key: str) -> None:
     wanted = " or ".join(dict.fromkeys(_wanted(hint, ranges=_is_number(value))))
     advice = f"; quote it twice: {key}='\"{value}\"'" if wanted.startswith("text") and _is_number(value) else ""
     raise UserError(f"{key} must be {wanted}, got {_shown(value)}{advice}")
+
+
+def rehearse(optimizer: Callable[..., Any] | None, scheduler: Callable[..., Any] | None) -> None:
+    """Makes both once with one weight, so that what they refuse is known before a fit begins; UserError."""
+    if optimizer is None:
+        return
+    with _refusals_named("optimizer"):
+        made = optimizer([torch.nn.Parameter(torch.zeros(1))])
+    if scheduler is not None:
+        with _refusals_named("scheduler"):
+            takes_end = "total_steps" in inspect.signature(scheduler).parameters
+            scheduler(made, **({"total_steps": 100} if takes_end else {}))
+
+
+@contextlib.contextmanager
+def _refusals_named(key: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
+        words = " ".join(str(error).split())
+        invalid = re.match(r"Invalid (learning rate|epsilon|beta|\w+)", words)
+        place = f"{key}.{_TORCH_WORDS.get(invalid[1], invalid[1])}" if invalid else key
+        raise UserError(f"{place}: {words}") from error
+
+
+_TORCH_WORDS = {"learning rate": "lr", "epsilon": "eps", "beta": "betas"}
 
 
 def _signatures(target: Any) -> Iterator[Callable[..., Any]]:

@@ -66,6 +66,14 @@ def trusted_packages() -> tuple[str, ...]:
     return tuple(name.strip() for name in os.environ.get("RENDRA_LAB_PACKAGES", "").split(",") if name.strip())
 
 
+def parameters_of_path(path: str) -> list[str]:
+    """The names of what an allowed target takes; none where it takes anything, or is not allowed."""
+    try:
+        return parameters_of(_locate(path, "")) or []
+    except UserError:
+        return []
+
+
 def _locate(path: Any, key: str) -> Any:
     if not isinstance(path, str):
         raise UserError(f"{key}._target_ must be the dotted name of a class or function, got {path!r}")
