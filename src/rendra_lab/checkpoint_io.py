@@ -61,7 +61,10 @@ class SafeCheckpointIO(CheckpointIO):
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
         """Tensors and plain values of a proven file, on the CPU; both options are Lightning's and change nothing."""
-        return read_checkpoint(Path(path))
+        content = read_checkpoint(Path(path))
+        if "pytorch-lightning_version" not in content:
+            raise CheckpointError(Path(path), "holds weights, but not the state of a fit that could go on")
+        return content
 
     def remove_checkpoint(self, path: str | Path) -> None:
         """Removes a file that newer ones have replaced; SaveError where that is not allowed."""

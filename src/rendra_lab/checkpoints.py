@@ -158,14 +158,24 @@ def _collected(damaged: list[CheckpointError]) -> Iterator[None]:
         yield
     except CheckpointError as error:
         damaged.append(error)
-    except OSError as error:  # gone meanwhile, or a disk that fails
+    except FileNotFoundError:  # removed meanwhile by a run that goes on
+        pass
+    except OSError as error:  # a disk that fails
         damaged.append(CheckpointError(Path(error.filename or "?"), f"cannot be read: {error.strerror}"))
 
 
 def _by_run(paths: Iterable[Path]) -> list[list[Path]]:
     """Files by the folder they lie in, that which was written to last first."""
     runs = [list(group) for _, group in itertools.groupby(sorted(paths), key=lambda path: path.parent)]
-    return sorted(runs, key=lambda run: max(path.lstat().st_mtime_ns for path in run), reverse=True)
+    return sorted(runs, key=lambda run: max(map(_written_at, run)), reverse=True)
+
+
+def _written_at(path: Path) -> int:
+    """Nanoseconds; 0 for what a run that goes on has removed meanwhile."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _task_folder(run_folder: Path, output_root: Path) -> Path:

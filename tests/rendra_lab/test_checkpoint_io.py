@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from rendra_lab import durable
-from rendra_lab.checkpoint_archive import examine, read_checkpoint
+from rendra_lab.checkpoint_archive import CheckpointError, examine, read_checkpoint
 from rendra_lab.checkpoint_io import SafeCheckpointIO, SaveError, describe
 from rendra_lab.durable import sweep_leftovers, write_durably
 from rendra_lab.weights_file import read_weights_file
@@ -159,6 +159,12 @@ def test_what_cannot_be_kept_is_said(tmp_path: Path) -> None:
         own.remove_checkpoint(tmp_path / "folder.ckpt")
 
 
+def test_a_fit_goes_on_from_the_state_of_a_fit(tmp_path: Path) -> None:
+    save(tmp_path / "last.ckpt", 1, 5)
+    with pytest.raises(CheckpointError, match="holds weights, but not the state of a fit that could go on"):
+        SafeCheckpointIO(METADATA).load_checkpoint(tmp_path / "last.ckpt")
+
+
 def test_an_error_of_the_writer_leaves_nothing(tmp_path: Path) -> None:
     def fill(sink: durable.Sink) -> None:
         sink.write(b"half")
@@ -174,7 +180,7 @@ def test_metadata_are_plain(tmp_path: Path) -> None:
     assert metadata["config"]["a"] == [1, "x"]
     assert metadata["versions"]["torch"] == torch.__version__
     own = SafeCheckpointIO(metadata)
-    own.save_checkpoint(state_of(2, 5), tmp_path / "last.ckpt")
+    own.save_checkpoint({**state_of(2, 5), "pytorch-lightning_version": "2.6.0"}, tmp_path / "last.ckpt")
     back = own.load_checkpoint(tmp_path / "last.ckpt")
     assert back["rendra_lab"] == metadata
     assert examine(tmp_path / "last.ckpt").module == "here.Pose"
