@@ -98,15 +98,13 @@ class ImageLogger(Callback):
     ) -> None:
         """Shows the first batch of a validation."""
         if batch_idx == 0 and not trainer.sanity_checking and _shows(trainer, pl_module, "panels"):
-            _publish(
-                trainer, _pictures(pl_module, batch), "val/panels", self.folder / f"val_{trainer.global_step:06d}.png"
-            )
+            _publish(trainer, _pictures(pl_module, batch), "val", self.folder / f"val_{trainer.global_step:06d}.png")
 
     def _write(self, trainer: Trainer, pl_module: LightningModule, name: str) -> None:
         pictures = _pictures(pl_module, self._batch)
         if pictures:
             self._shown.append((trainer.global_step, pictures))
-            _publish(trainer, pictures, "train/panels", self.folder / name)
+            _publish(trainer, pictures, "train", self.folder / name)
 
     def _thin_out(self) -> None:
         if len(self._shown) >= self.max_files:
@@ -348,13 +346,13 @@ class StopWhenSettled(Callback):
 
 
 def _publish(trainer: Trainer, pictures: dict[str, np.ndarray], tag: str, path: Path) -> None:
-    """Pictures in a row, as a file and in TensorBoard."""
+    """Pictures in a row as a file, and by their names in TensorBoard."""
     if not pictures:
         return
-    sheet = visualization.captioned_row(pictures)
-    visualization.save_picture(path, sheet)
+    visualization.save_picture(path, visualization.captioned_row(pictures))
     for writer in writers(trainer):
-        writer.add_image(tag, sheet, trainer.global_step, dataformats="HWC")
+        for name, picture in pictures.items():
+            writer.add_image(f"{tag}/{name}", picture, trainer.global_step, dataformats="HWC")
 
 
 def add_mesh(writer: Any, name: str, meshes: Any, step: int) -> None:

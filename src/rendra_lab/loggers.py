@@ -3,12 +3,47 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import logging
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+log = logging.getLogger(__name__)
+
+
+class LogKeeper(Callback):
+    """Keeps the logs of a run in step with its checkpoints, so that a resumed run goes on where it was cut off.
+
+    A checkpoint brings to disk whatever was logged before. The first step of a fit cuts from the logs that lie in
+    the run's folder what an ended process logged from that step on. Every run that has loggers has it, as the first
+    of its callbacks.
+    """
+
+    def __init__(self) -> None:
+        self._is_cut = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """A fit begins."""
+        self._is_cut = False
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Cuts the logs before the first step."""
+        if not self._is_cut:
+            self._is_cut = True
+            step = trainer.fit_loop.epoch_loop._batches_that_stepped  # what Lightning gives loggers as their step
+            for logger in trainer.loggers:
+                if isinstance(logger, TensorBoard | CsvTable):
+                    logger.cut(step)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Brings the logs to disk."""
+        for logger in trainer.loggers:
+            logger.save()
 
 
 class TensorBoard(Logger):
@@ -22,6 +57,7 @@ class TensorBoard(Logger):
         super().__init__()
         self.folder = folder
         self._writer: Any = None
+        self._is_owed = False
 
     @property
     def name(self) -> str:
@@ -36,11 +72,11 @@ class TensorBoard(Logger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        """The `SummaryWriter`, opened at the first use."""
+        """The `EventWriter`, a `SummaryWriter`, opened at the first use."""
         if self._writer is None:
-            from torch.utils.tensorboard import SummaryWriter
+            from rendra_lab.event_files import EventWriter
 
-            self._writer = SummaryWriter(self.folder)
+            self._writer = EventWriter(self.folder)
         return self._writer
 
     @rank_zero_only
@@ -48,14 +84,38 @@ class TensorBoard(Logger):
         """Adds one scalar a name."""
         for name, value in metrics.items():
             self.experiment.add_scalar(name, value, step)
+        if self._is_owed:
+            self.experiment.flush()
+            self._is_owed = False
 
     @rank_zero_only
-    def log_hyperparams(self, params: Any, metrics: Mapping[str, float] | None = None, *_: Any, **__: Any) -> None:
-        """Fills a row of TensorBoard's HPARAMS tab; the metrics must stand among the scalars already."""
-        from torch.utils.tensorboard.summary import hparams
+    def log_hyperparams(self, params: Any, *_: Any, name: str = "", **__: Any) -> None:
+        """Fills the run's row of TensorBoard's HPARAMS tab.
 
-        for summary in hparams(dict(params), dict(metrics or {})):
-            self.experiment.file_writer.add_summary(summary)
+        The tab makes one table of all runs: their settings, and the last value of each scalar. A list of columns,
+        which torch's `add_hparams` adds, would be the first run's for all of them.
+
+        Args:
+            params: numbers, words and switches by name.
+            name: of the row; rows of the same name are shown as one, by their mean.
+        """
+        from tensorboard.plugins.hparams.api_pb2 import Status
+        from tensorboard.plugins.hparams.summary import session_end_pb, session_start_pb
+
+        self.experiment.add_summary(session_start_pb(dict(params), group_name=name))
+        self.experiment.add_summary(session_end_pb(Status.Value("STATUS_SUCCESS")))
+
+    @rank_zero_only
+    def cut(self, step: int) -> None:
+        """Lets TensorBoard forget what earlier event files of the folder say about this step and later ones."""
+        self.experiment.purge(step)
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Brings everything to disk, and what is logged next at once: a step is logged after its checkpoint."""
+        if self._writer is not None:
+            self._writer.flush()
+            self._is_owed = True
 
     @rank_zero_only
     def log_gif(self, tag: str, path: Path, step: int) -> None:
@@ -67,7 +127,7 @@ class TensorBoard(Logger):
             width, height = image.size
         content = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
         summary = Summary(value=[Summary.Value(tag=tag, image=content)])
-        self.experiment.file_writer.add_summary(summary, step)
+        self.experiment.add_summary(summary, step)
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
@@ -89,6 +149,8 @@ class CsvTable(Logger):
     Args:
         path: of the table. An existing one is continued.
         flush_every_rows: how many rows may wait in memory.
+
+    A disk that takes no more is said once; the rows wait until it does.
     """
 
     def __init__(self, path: str, flush_every_rows: int = 100) -> None:
@@ -97,6 +159,8 @@ class CsvTable(Logger):
         self.flush_every_rows = flush_every_rows
         self._rows: list[dict[str, Any]] = []
         self._columns: list[str] | None = None
+        self._is_owed = False
+        self._is_full = False
 
     @property
     def name(self) -> str:
@@ -112,8 +176,9 @@ class CsvTable(Logger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Adds one row."""
         self._rows.append({"step": step, **metrics})
-        if len(self._rows) >= self.flush_every_rows:
-            self.save()
+        if self._is_owed or len(self._rows) >= self.flush_every_rows:
+            self._write()
+            self._is_owed = False
 
     @rank_zero_only
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
@@ -122,36 +187,68 @@ class CsvTable(Logger):
     @rank_zero_only
     def finalize(self, status: str) -> None:
         """Brings everything to disk; writing may go on."""
-        self.save()
+        self._write()
 
     @rank_zero_only
     def save(self) -> None:
+        """Brings everything to disk, and the next row at once: a step is logged after its checkpoint."""
+        self._write()
+        self._is_owed = True
+
+    @rank_zero_only
+    def cut(self, step: int) -> None:
+        """Drops the rows of this step and later ones."""
+        columns, rows = self._read()
+        if columns:
+            self._replace(columns, [row for row in rows if row["step"].isdecimal() and int(row["step"]) < step])
+
+    def _write(self) -> None:
         """Appends the waiting rows; new columns rewrite the table under a longer header."""
         if not self._rows:
             return
+        try:
+            self._append()
+        except OSError as problem:
+            if not self._is_full:
+                log.warning("%s takes no more rows, the run goes on: %s", self.path, problem)
+            self._is_full = True
+
+    def _append(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        columns = self._read_header() if self._columns is None else self._columns
+        columns = self._read()[0] if self._columns is None else self._columns
         names = dict.fromkeys(name for row in self._rows for name in row)
         missing = [name for name in names if name not in columns]
         if missing:
-            self._widen(columns + missing)
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, columns + missing).writerows(self._rows)
+            self._replace(columns + missing, [*self._read()[1], *self._rows])
+        else:
+            self._extend(columns)
         self._columns = columns + missing
         self._rows = []
 
-    def _read_header(self) -> list[str]:
-        if not self.path.exists():
-            return []
-        with self.path.open(newline="") as file:
-            return next(csv.reader(file), [])
+    def _extend(self, columns: Sequence[str]) -> None:
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("a", newline="") as file:
+                csv.DictWriter(file, columns).writerows(self._rows)
+        except OSError:
+            os.truncate(self.path, size)
+            raise
 
-    def _widen(self, columns: list[str]) -> None:
-        rows: list[dict[str, Any]] = []
-        if self.path.exists():
-            with self.path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        with self.path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows(rows)
+    def _read(self) -> tuple[list[str], list[dict[str, Any]]]:
+        """Header and rows, without a last line that was cut off."""
+        if not self.path.exists():
+            return [], []
+        lines = self.path.read_bytes().decode().splitlines(keepends=True)
+        table = csv.DictReader(line for line in lines if line.endswith("\n"))
+        return list(table.fieldnames or []), list(table)
+
+    def _replace(self, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+        partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
+        try:
+            with partial.open("w", newline="") as file:
+                table = csv.DictWriter(file, columns, extrasaction="ignore")
+                table.writeheader()
+                table.writerows(rows)
+            partial.replace(self.path)
+        finally:
+            partial.unlink(missing_ok=True)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +35,8 @@ class Streams:
 
     python: Any
     numpy: Any
-    torch: torch.Tensor
-    cuda: tuple[torch.Tensor, ...] = ()
+    torch: Tensor
+    cuda: tuple[Tensor, ...] = ()
     owned: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

@@ -144,7 +144,7 @@ def test_a_run_ends_with_films_and_views(
     (events,) = finished.glob("events.out.tfevents.*")
     shown = EventAccumulator(str(events))
     shown.Reload()
-    assert {"film/turntable", "film/depth", "film/normals", "test/000", "test/001"} <= set(shown.Tags()["images"])
+    assert {"film/turntable", "film/depth", "film/normals", "test/000/target", "test/001/target"} <= set(shown.Tags()["images"])
     assert "film/frames_per_s" in shown.Tags()["scalars"]
     assert shown.Images("film/turntable")[0].encoded_image_string.startswith(b"GIF8")
 

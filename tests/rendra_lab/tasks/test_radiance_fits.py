@@ -9,7 +9,7 @@ import pytest
 import torch
 from far_device import Far, far  # noqa: F401
 from lightning.pytorch import Trainer
-from torch import Tensor, nn
+from torch import nn
 
 from rendra.renderer import AmbientLights, TexturesVertex
 from rendra.structures import Meshes

@@ -79,7 +79,7 @@ class MeshFit(Task[CloudBatch, SurfacePrediction]):
             self.surface.place(self.trainer.datamodule.cloud.points[0].to(self.device))  # type: ignore[attr-defined]
 
     def on_train_batch_start(self, batch: CloudBatch, batch_idx: int) -> None:
-        """Lightning's hook: takes back, now and then, what made the surface cross itself; refines it when it is time."""
+        """Lightning's hook: now and then takes back what made the surface cross itself; refines it in time."""
         step = self.global_step
         level = sum(begin <= step for begin in self.refine_at)
         is_coarse = level > int(self.surface.level)
