@@ -71,7 +71,7 @@ class Panel {
       this.box("axes", "axes"),
       this.choice("up", "up", [["y", "y"], ["z", "z"]]),
       this.choice("background", "ground", Object.keys(BACKGROUNDS).map((name) => [name, name])),
-      this.button("first view", () => actions.press("r")),
+      this.button("reset", () => actions.press("r")),
       this.button("picture", () => actions.savePicture()),
       this.button("?", () => { this.help.hidden = !this.help.hidden; }),
     ].filter(Boolean);
@@ -124,7 +124,7 @@ class Panel {
     const shown = scene.items.filter((item) => item.visible);
     const sums = {};
     for (const item of shown) for (const [kind, count] of Object.entries(item.counts)) sums[kind] = (sums[kind] || 0) + count;
-    const box = boxAround(shown.filter((item) => item.bounds).map((item) => item.bounds));
+    const box = state.apart ? null : boxAround(shown.filter((item) => item.bounds).map((item) => item.bounds));
     this.counts.textContent = [countsText(sums), sizeText(box)].filter(Boolean).join(" · ");
     root.dataset.ground = state.background === "dark" || state.background === "grey" ? "dark" : "light";
     if (!scene.box) this.say("There is nothing to draw here.");
