@@ -99,11 +99,12 @@ class TensorBoard(Logger):
             params: numbers, words and switches by name.
             name: of the row; rows of the same name are shown as one, by their mean.
         """
-        from tensorboard.plugins.hparams.api_pb2 import Status
-        from tensorboard.plugins.hparams.summary import session_end_pb, session_start_pb
+        from tensorboard.plugins.hparams.summary_v2 import hparams_pb  # its neighbour `summary` wants TensorFlow
+        from torch.utils.tensorboard.summary import hparams
 
-        self.experiment.add_summary(session_start_pb(dict(params), group_name=name))
-        self.experiment.add_summary(session_end_pb(Status.Value("STATUS_SUCCESS")))
+        *_, success = hparams({}, {})
+        self.experiment.add_summary(hparams_pb(dict(params), trial_id=name))
+        self.experiment.add_summary(success)
 
     @rank_zero_only
     def cut(self, step: int) -> None:
