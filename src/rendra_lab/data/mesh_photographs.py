@@ -5,6 +5,7 @@ Image axes and units as in `posed_images`. Colours are averaged as the shader gi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -69,6 +70,8 @@ class Shots(TensorRecord):
             raise UserError(f"data.fov_deg must lie between 0 and 180 degrees, got {fov_deg}")
         if len(distortion) > NUM_DISTORTION:
             raise UserError(f"data.distortion has at most {NUM_DISTORTION} coefficients, got {len(distortion)}")
+        if not all(map(math.isfinite, distortion)):
+            raise UserError(f"data.distortion holds finite numbers, got {[*distortion]}")
         height, width = size
         focal = min(size) / 2 / float(torch.tensor(fov_deg / 2).deg2rad().tan())
         lens = [*distortion, *[0.0] * (NUM_DISTORTION - len(distortion))]

@@ -28,6 +28,7 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA")  # rasters only:
 _MOST_PIXELS = 8192 * 8192
 _MOST_BYTES = 8 << 30
 _ORIENTATION = 0x0112
+_LARGEST = 1e18  # number of a camera: float32 holds its square too
 _RIGID = 1e-3  # how far R^T R may be from the identity
 
 
@@ -125,8 +126,10 @@ def read_photographs(photographs: Sequence[Photograph], shrink: int = 1) -> Pose
             are left over at the lower right are dropped.
 
     Raises:
-        UserError: a picture that cannot be read, or more than 8 GiB of pixels.
+        UserError: a picture that cannot be read, more than 8 GiB of pixels, or a camera of absurd numbers.
     """
+    for photograph in photographs:
+        _demand_float32(photograph)
     sizes = torch.tensor([p.size for p in photographs], dtype=torch.int64).reshape(-1, 2) // shrink
     for photograph, size in zip(photographs, sizes.tolist(), strict=True):
         if min(size) < 1:
@@ -151,6 +154,23 @@ def read_photographs(photographs: Sequence[Photograph], shrink: int = 1) -> Pose
         with ThreadPoolExecutor(max_workers=min(8, 1 + (os.cpu_count() or 1))) as pool:
             alphas = list(pool.map(fill, range(len(photographs))))
     return _posed(photographs, pixels, sizes, shrink, any(alphas))
+
+
+def _demand_float32(photograph: Photograph) -> None:
+    """Refuse cameras whose numbers float32 cannot hold, or not their squares."""
+    camera = {
+        "intrinsics": photograph.intrinsics,
+        "distortion": photograph.distortion,
+        "pose": (*photograph.R.flatten().tolist(), *photograph.T.tolist()),
+    }
+    for name, numbers in camera.items():
+        absurd = [number for number in numbers if not abs(number) < _LARGEST]
+        if name == "intrinsics":
+            absurd += [focal for focal in numbers[:2] if not focal > 1 / _LARGEST]
+        if absurd:
+            raise UserError(
+                f"{photograph.where}: numbers of the camera's {name} do not fit into 32 bits: {absurd[0]:g}"
+            )
 
 
 def _posed(

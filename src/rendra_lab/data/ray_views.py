@@ -371,13 +371,17 @@ class SceneViews(LightningDataModule, ABC):
 
 def _schedule(sides: int | Sequence[Sequence[int]]) -> list[tuple[int, int]]:
     """Pairs (step, side), the first at step 0."""
-    pairs = [(0, sides)] if isinstance(sides, int) else [(int(step), int(side)) for step, side in sides]
+    complaint = UserError(
+        "data.rays_per_pixel_side is a whole number of at least 1, or pairs [step, side] of rising steps, the "
+        f"first 0, got {sides!r}"
+    )
+    try:
+        pairs = [(0, sides)] if isinstance(sides, int) else [(int(step), int(side)) for step, side in sides]
+    except (TypeError, ValueError) as error:
+        raise complaint from error
     steps = [step for step, _ in pairs]
     if not pairs or steps[0] != 0 or sorted(steps) != steps or min(side for _, side in pairs) < 1:
-        raise UserError(
-            "data.rays_per_pixel_side is a whole number of at least 1, or pairs [step, side] of rising steps, the "
-            f"first 0, got {sides!r}"
-        )
+        raise complaint
     return pairs
 
 

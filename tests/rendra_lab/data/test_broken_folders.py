@@ -194,6 +194,13 @@ BROKEN_TRANSFORMS = {
     "eighth power": (put("k4", 0.1), "'k4' is 0.1, which camera model OPENCV"),
     "tangential fisheye": (lambda tree: tree.update(is_fisheye=True, p1=0.1), "'p1' is 0.1.*FISHEYE"),
     "fisheye is a text": (put("is_fisheye", "no"), "'is_fisheye' is 'no'"),
+    "focal beyond float32": (put("fl_x", 1e39), r"frame \d: .*intrinsics.* do not fit into 32 bits: 1e\+39"),
+    "focal below float32": (put("fl_x", 1e-60), r"frame \d: .*intrinsics.* do not fit into 32 bits: 1e-60"),
+    "lens beyond float32": (put("k1", -1e300), r"frame \d: .*distortion.* do not fit into 32 bits: -1e\+300"),
+    "far away": (
+        lambda tree: tree["frames"][2]["transform_matrix"][0].__setitem__(3, 1e40),
+        r"frame 2: .*pose.* do not fit into 32 bits",
+    ),
     "NaN lens": (put("k1", float("nan")), "'k1' is nan"),
     "applied transform": (put("applied_transform", [1, 2]), "'applied_transform'"),
     "mask missing": (put(*FRAME, "mask_path", "m.png"), r"frame 2, mask: there is no file .*m\.png"),

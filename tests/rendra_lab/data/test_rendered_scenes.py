@@ -1,6 +1,7 @@
 """data=cow_views: its scene, its splits and its cache."""
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,8 @@ def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path: Path, caplog: p
         ({"image_size": 0}, r"data\.image_size must be one side or \[height,width\]"),
         ({"image_size": [4, 5, 6]}, r"data\.image_size"),
         ({"counts": [4, 5]}, r"data\.counts are three"),
+        ({"distortion": [0.1, math.nan]}, r"data\.distortion holds finite numbers, got \[0\.1, nan\]"),
+        ({"rays_per_pixel_side": [[0]]}, r"data\.rays_per_pixel_side is a whole number.*got \[\[0\]\]"),
         ({"background": "green"}, r"data\.background must be one of white, black, random"),
     ],
 )
