@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from rendra.structures import Meshes
 from rendra_lab.data.posed_images import PosedImages
+from rendra_lab.data.repeated import StepByStep
 from rendra_lab.data.shares import Share
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
@@ -175,7 +176,7 @@ def _as_view(flat: RayBatch, images: PosedImages, index: int) -> RayBatch:
     )
 
 
-class RandomPixels:
+class RandomPixels(StepByStep[RayBatch]):
     """Endless random pixels of the training images; one pass is one epoch of `steps` batches.
 
     The random numbers of a step follow from seed and step alone, so a resumed run sees what it would have seen, and
@@ -194,26 +195,12 @@ class RandomPixels:
         self.share: Share = how.get("share", Share())
         self.focus: float = how["focus"] if images.has_alpha and self.views_per_step is None else 0.0
         self._near = pixels_near_matter(images) if self.focus > 0 else torch.zeros(0, dtype=torch.int32)
-        self._next = 0
 
     def __len__(self) -> int:
         return self.steps
 
-    def __iter__(self) -> Iterator[RayBatch]:
-        while self._next < self.steps:
-            self._next += 1
-            yield self._batch(self._next - 1)
-        self._next = 0
-
-    def state_dict(self) -> dict[str, int]:
-        """How far the running epoch is; Lightning keeps it in checkpoints."""
-        return {"next": self._next}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Lets the next epoch be the rest of one that a checkpoint interrupted."""
-        self._next = state["next"] % self.steps
-
-    def _batch(self, step: int) -> RayBatch:
+    def batch_of(self, step: int) -> RayBatch:
+        """The pixels of a step."""
         mixed = np.random.SeedSequence([self.seed, step]).generate_state(1)  # torch takes 32 bits of a seed alone
         generator = torch.Generator().manual_seed(int(mixed[0]))
         caster = self.casters(step)

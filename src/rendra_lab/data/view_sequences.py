@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from rendra.renderer.cameras import look_at_view_transform
+from rendra_lab.data.repeated import StepByStep
 from rendra_lab.data.views import ViewBatch, check_visible, render_views
 from rendra_lab.networks.mesh_view import MeshView
+from rendra_lab.settings import Positive
 
 
-class FrameByFrame:
+class FrameByFrame(StepByStep[ViewBatch]):
     """Yields frame after frame, each several times; one pass is one epoch.
 
     Args:
         frames: the frames, a batch of one each.
         times: how often each is yielded.
-        steps_done: tells how many steps a resumed run has behind it, so that it goes on with the right frame.
     """
 
-    def __init__(
-        self, frames: Sequence[ViewBatch], times: int = 1, steps_done: Callable[[], int] = lambda: 0
-    ) -> None:
+    def __init__(self, frames: Sequence[ViewBatch], times: int = 1) -> None:
         self.frames = frames
         self.times = times
-        self.steps_done = steps_done
 
     def __len__(self) -> int:
         return len(self.frames) * self.times
 
-    def __iter__(self) -> Iterator[ViewBatch]:
-        for step in range(self.steps_done() % len(self), len(self)):
-            yield self.frames[step // self.times]
+    def batch_of(self, step: int) -> ViewBatch:
+        """The frame of a step."""
+        return self.frames[step // self.times]
 
 
 class RenderedSequence(LightningDataModule):
@@ -52,8 +50,8 @@ class RenderedSequence(LightningDataModule):
     def __init__(
         self,
         scene: MeshView,
-        frames: int = 24,
-        steps_per_frame: int = 6,
+        frames: Positive = 24,
+        steps_per_frame: Positive = 6,
         distance: tuple[float, float] = (3.0, 2.5),
         elevation_deg: tuple[float, float] = (30.0, 50.0),
         azimuth_deg: tuple[float, float] = (10.0, 150.0),
@@ -80,14 +78,11 @@ class RenderedSequence(LightningDataModule):
 
     def train_dataloader(self) -> FrameByFrame:
         """Every frame, `steps_per_frame` times."""
-        return FrameByFrame(self.views, self.steps_per_frame, self._steps_done)
+        return FrameByFrame(self.views, self.steps_per_frame)
 
     def test_dataloader(self) -> FrameByFrame:
         """Every frame once."""
         return FrameByFrame(self.views)
-
-    def _steps_done(self) -> int:
-        return 0 if self.trainer is None else self.trainer.global_step
 
 
 def _even(count: int, first: float, last: float) -> Tensor:

@@ -93,7 +93,9 @@ def test_a_sequence_is_walked_frame_by_frame(scene):
 def test_a_resumed_sequence_goes_on_where_it_was(scene):
     data = RenderedSequence(scene, frames=3, steps_per_frame=2)
     data.setup("fit")
-    assert [int(batch.frame) for batch in FrameByFrame(data.views, 2, lambda: 3)] == [1, 2, 2]
+    resumed = FrameByFrame(data.views, 2)
+    resumed.load_state_dict({"given": 3})
+    assert [int(batch.frame) for batch in resumed] == [1, 2, 2]
 
 
 def empty_views(scene):

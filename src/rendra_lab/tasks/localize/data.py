@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from rendra.io.errors import MeshFormatError
 from rendra.ops import sample_points_from_meshes
 from rendra.structures import Meshes, join_meshes_as_batch
 from rendra_lab.data.meshes import load_mesh
+from rendra_lab.data.repeated import StepByStep
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
 from rendra_lab.tasks.localize.solids import SOLIDS, subdivided
@@ -34,7 +35,7 @@ class SightBatch(TensorRecord):
     titles: list[str]  # of the meshes
 
 
-class Looks:
+class Looks(StepByStep[SightBatch]):
     """Yields look after look, with new points in each.
 
     A look's points depend on its number alone, so that a resumed fit sees what an uninterrupted one would.
@@ -42,22 +43,18 @@ class Looks:
     Args:
         look: makes the look of a number.
         count: looks an epoch.
-        steps_done: tells how many steps a resumed run has behind it.
     """
 
-    def __init__(
-        self, look: Callable[[int], SightBatch], count: int = 1, steps_done: Callable[[], int] = lambda: 0
-    ) -> None:
+    def __init__(self, look: Callable[[int], SightBatch], count: int = 1) -> None:
         self.look = look
         self.count = count
-        self.steps_done = steps_done
 
     def __len__(self) -> int:
         return self.count
 
-    def __iter__(self) -> Iterator[SightBatch]:
-        for step in range(self.steps_done() % self.count, self.count):
-            yield self.look(step)
+    def batch_of(self, step: int) -> SightBatch:
+        """The look of a step."""
+        return self.look(step)
 
 
 class SeenSolids(LightningDataModule):
@@ -125,14 +122,11 @@ class SeenSolids(LightningDataModule):
 
     def train_dataloader(self) -> Looks:
         """`steps` looks."""
-        return Looks(self.look, self.steps, self._steps_done)
+        return Looks(self.look, self.steps)
 
     def test_dataloader(self) -> Looks:
         """One look."""
         return Looks(self.look)
-
-    def _steps_done(self) -> int:
-        return 0 if self.trainer is None else self.trainer.global_step
 
 
 def _check_settings(displacement: Sequence[float], noise_variance: float, measurements: int, samples: int) -> None:
