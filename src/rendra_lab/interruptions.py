@@ -83,6 +83,8 @@ class LastStepKeeper(Checkpoint):
         if self._in_validation:
             progress = checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]
             progress["current"] = dict.fromkeys(progress["current"], 0)
+            done = progress["total"]["started"] - 1  # Lightning knows by this that a batch was under way
+            progress["total"].update(processed=done, completed=done)
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Signals are ours again, not Lightning's."""
