@@ -18,6 +18,7 @@ from rendra_lab import report, visualization
 from rendra_lab.base_task import BaseTask
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
+from rendra_lab.settings import Amount, Count, Positive, Size
 
 
 def every(step: int, interval: int) -> bool:
@@ -69,7 +70,7 @@ class ImageLogger(Callback):
         max_files: when reached, every second file goes and the interval doubles.
     """
 
-    def __init__(self, folder: str, every_n_steps: int = 50, max_files: int = 64) -> None:
+    def __init__(self, folder: str, every_n_steps: Count = 50, max_files: Positive = 64) -> None:
         self.folder = Path(folder)
         self.every_n_steps = every_n_steps
         self.max_files = max_files
@@ -126,7 +127,12 @@ class AnimationWriter(Callback):
     """
 
     def __init__(
-        self, path: str, every_n_steps: int = 5, max_frames: int = 48, fps: float = 12.0, height_px: int = 192
+        self,
+        path: str,
+        every_n_steps: Count = 5,
+        max_frames: Positive = 48,
+        fps: Size = 12.0,
+        height_px: Positive = 192,
     ) -> None:
         self.path = Path(path)
         self.every_n_steps = every_n_steps
@@ -171,7 +177,7 @@ class MeshLogger(Callback):
         UserError: an ending that no format has.
     """
 
-    def __init__(self, folder: str, every_n_steps: int = 200, formats: Sequence[str] = ("ply",)) -> None:
+    def __init__(self, folder: str, every_n_steps: Count = 200, formats: Sequence[str] = ("ply",)) -> None:
         self.folder = Path(folder)
         self.every_n_steps = every_n_steps
         self.formats = [ending.lower().lstrip(".") for ending in formats]
@@ -251,9 +257,9 @@ class BatchReport(Callback):
         table: str,
         animation: str | None = None,
         pictures: str | None = None,
-        max_pictures: int = 24,
-        fps: float = 8.0,
-        height_px: int = 192,
+        max_pictures: Count = 24,
+        fps: Size = 8.0,
+        height_px: Positive = 192,
     ) -> None:
         self.table = Path(table)
         self.animation = None if animation is None else Path(animation)
@@ -311,8 +317,8 @@ class StopWhenSettled(Callback):
         self,
         monitor: str = "train/loss",
         below: float | None = None,
-        patience: int | None = None,
-        improvement: float = 1e-3,
+        patience: Positive | None = None,
+        improvement: Amount = 1e-3,
     ) -> None:
         self.monitor = monitor
         self.below = below

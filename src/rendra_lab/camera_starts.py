@@ -14,6 +14,7 @@ from rendra_lab.data.views import ViewBatch, check_visible, shrink
 from rendra_lab.networks.camera_pose import CameraPose, PosePrediction, SixDofPose, look_at_origin
 from rendra_lab.networks.mesh_view import MeshView
 from rendra_lab.optimizers import levenberg_marquardt_step
+from rendra_lab.settings import Positive, Size
 
 Residuals = Callable[[PosePrediction, ViewBatch], Tensor]
 """A task's `residuals_of`: one prediction, one target of the same size -> a vector (D,)."""
@@ -71,10 +72,10 @@ class MultiStart:
 
     def __init__(
         self,
-        directions: int = 256,
-        rolls: int = 12,
+        directions: Positive = 256,
+        rolls: Positive = 12,
         levels: Sequence[Sequence[int]] = ((64, 16, 12, 6), (128, 32, 4, 6), (256, 64, 2, 5)),
-        difference: float = 0.03,
+        difference: Size = 0.03,
         at_once: int = 32,
     ) -> None:
         if directions < 1 or rolls < 1 or not levels:

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rendra_lab.settings import Positive, Size
+
 _DOUBLINGS = 8  # of a step that pays: 256 times its length
 
 
@@ -39,8 +41,8 @@ class LevenbergMarquardt(torch.optim.Optimizer):
         params: Any,
         lr: float = 0.5,
         difference: Sequence[float] = (0.2, 5e-3),
-        damping: float = 1e-2,
-        tries: int = 4,
+        damping: Size = 1e-2,
+        tries: Positive = 4,
     ) -> None:
         widest, finest = difference
         if not widest >= finest > 0:

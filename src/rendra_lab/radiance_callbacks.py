@@ -13,6 +13,7 @@ from rendra_lab.data.ray_views import SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
 from rendra_lab.radiance_film import SHOWN, can_write_mp4, shoot
+from rendra_lab.settings import Count, Size
 from rendra_lab.trajectories import WAYS, trajectory
 from rendra_lab.visualization import Picture, save_animation
 
@@ -42,10 +43,10 @@ class Turntable(Callback):
         self,
         folder: str,
         trajectory: str = "auto",
-        frames: int = 60,
+        frames: Count = 60,
         size: int | None = None,
         elevation_deg: float | None = None,
-        fps: float = 20.0,
+        fps: Size = 20.0,
         shown: Sequence[str] = SHOWN,
     ) -> None:
         if trajectory not in WAYS and not trajectory.endswith(".json"):

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from rendra_lab.settings import Amount, Count
 from rendra_lab.terms import PiecewiseLinear
 
 
-def cosine(optimizer: Optimizer, total_steps: int, final_factor: float = 0.01, warmup_steps: int = 0) -> LambdaLR:
+def cosine(optimizer: Optimizer, total_steps: int, final_factor: Amount = 0.01, warmup_steps: Count = 0) -> LambdaLR:
     """Half a cosine from the optimizer's rate down to `final_factor` times it, after a linear warm-up.
 
     Source: Loshchilov and Hutter, "SGDR", ICLR 2017, Eq. 5, without restarts.
@@ -26,7 +27,7 @@ def cosine(optimizer: Optimizer, total_steps: int, final_factor: float = 0.01, w
     return LambdaLR(optimizer, factor)
 
 
-def exponential(optimizer: Optimizer, total_steps: int, final_factor: float = 0.1) -> LambdaLR:
+def exponential(optimizer: Optimizer, total_steps: int, final_factor: Amount = 0.1) -> LambdaLR:
     """The rate falls by the same factor every step and ends at `final_factor` times the optimizer's rate."""
     if final_factor <= 0:
         raise ValueError(f"final_factor must be above 0, got {final_factor}")
@@ -38,7 +39,7 @@ def piecewise(optimizer: Optimizer, knots: Sequence[Sequence[float]]) -> LambdaL
     return LambdaLR(optimizer, PiecewiseLinear(knots))
 
 
-def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, final_factor: float = 0.1) -> LambdaLR:
+def restarted(optimizer: Optimizer, total_steps: int, at: float = 0.75, final_factor: Amount = 0.1) -> LambdaLR:
     """After a share `at` of the run the rate is `final_factor` times what it was, and the optimizer starts anew.
 
     As if another optimizer took over: Adam's running means are forgotten.

@@ -34,7 +34,7 @@ class Range:
 
     def __str__(self) -> str:
         if math.isinf(self.most):
-            return f"{'at least' if self.closed else 'above'} {self.least:g}"
+            return f"{'of at least' if self.closed else 'above'} {self.least:g}"
         return (
             f"from {self.least:g} to {self.most:g}" if self.closed else f"above {self.least:g}, at most {self.most:g}"
         )
@@ -44,7 +44,7 @@ Count = Annotated[int, Range(0)]
 Positive = Annotated[int, Range(1)]
 Size = Annotated[float, Range(0, closed=False)]
 Amount = Annotated[float, Range(0)]
-Share = Annotated[float, Range(0, 1)]
+Fraction = Annotated[float, Range(0, 1)]
 
 _NAMES: dict[Any, str] = {
     int: "a whole number",
@@ -247,7 +247,10 @@ def _fits_plain(value: Any, hint: Any) -> bool:
         return isinstance(value, list)
     if hint is dict:
         return isinstance(value, Mapping)
-    return hint is not type(None)  # a class: whoever takes it knows what it can do with the value
+    if isinstance(hint, type) and isinstance(value, bool | int | float | str):
+        with contextlib.suppress(TypeError):
+            return isinstance(value, hint)
+    return hint is not type(None)  # whoever takes it knows what it can do with the value
 
 
 def _is_plain(hint: Any) -> bool:

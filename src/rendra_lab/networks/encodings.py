@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from rendra.kernels.encode_grid import COMBINATIONS, encode_grid, encode_planes, grid_offsets, grid_resolutions
+from rendra_lab.settings import Positive, Range
 
 
 class HashGrid(nn.Module):
@@ -34,11 +36,11 @@ class HashGrid(nn.Module):
 
     def __init__(
         self,
-        levels: int = 12,
-        features: int = 2,
-        log2_table_size: int = 15,
-        coarsest: int = 16,
-        finest: int = 256,
+        levels: Positive = 12,
+        features: Positive = 2,
+        log2_table_size: Annotated[int, Range(1, 24)] = 15,
+        coarsest: Positive = 16,
+        finest: Positive = 256,
     ) -> None:
         super().__init__()
         if features < 1:
@@ -74,7 +76,9 @@ class TriPlane(nn.Module):
         ValueError: a size or combination that cannot be.
     """
 
-    def __init__(self, resolutions: Sequence[int] = (64, 128), features: int = 8, combine: str = "product") -> None:
+    def __init__(
+        self, resolutions: Sequence[int] = (64, 128), features: Positive = 8, combine: str = "product"
+    ) -> None:
         super().__init__()
         if not resolutions or min(resolutions) < 2 or features < 1:
             raise ValueError(
@@ -111,7 +115,7 @@ class SphericalHarmonics(nn.Module):
         ValueError: bands not in 1..4.
     """
 
-    def __init__(self, bands: int = 4) -> None:
+    def __init__(self, bands: Annotated[int, Range(1, 5)] = 4) -> None:
         super().__init__()
         if not 1 <= bands <= 4:
             raise ValueError(f"spherical harmonics are there for 1 to 4 bands, got {bands}")

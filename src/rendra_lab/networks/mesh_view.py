@@ -23,6 +23,7 @@ from rendra.renderer import (
     opengl_from_cameras,
 )
 from rendra.structures import Meshes
+from rendra_lab.settings import Positive, Size
 
 _NEGLIGIBLE = 1e-4  # coverage at which a face stops reaching outwards
 
@@ -46,8 +47,8 @@ class MeshView(nn.Module):
         mesh: Meshes,
         image_size: int | Sequence[int] = 256,
         fov_deg: float = 60.0,
-        sigma: float = 1e-4,
-        layers: int = 1,
+        sigma: Size = 1e-4,
+        layers: Positive = 1,
         lights: Any = None,
         background: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:

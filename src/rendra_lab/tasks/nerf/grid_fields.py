@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from rendra.kernels.composite import alphas_of
 from rendra_lab.errors import UserError
 from rendra_lab.number_checks import check_above_zero, check_at_least
+from rendra_lab.settings import Count, Positive
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 _LARGEST_EXPONENT = 12.0  # exp(12) per unit of length is opaque at every step anybody takes
@@ -66,10 +67,10 @@ class GridField(RadianceField):
         self,
         encoding: Encoding,
         directions: Encoding | None = None,
-        width: int = 64,
-        density_layers: int = 1,
-        color_layers: int = 2,
-        memory: int = 15,
+        width: Positive = 64,
+        density_layers: Count = 1,
+        color_layers: Count = 2,
+        memory: Count = 15,
         start_density: float = 1.0,
     ) -> None:
         super().__init__()

@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from rendra.kernels.composite import alphas_of
 from rendra_lab.errors import UserError
+from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 
@@ -103,7 +104,7 @@ class MLPBook(MLPField):
     is_density = False
     frequencies: Tensor
 
-    def __init__(self, width: int = 256, frequencies: int = 60, chunk: int = 1 << 15) -> None:
+    def __init__(self, width: Positive = 256, frequencies: Count = 60, chunk: int = 1 << 15) -> None:
         super().__init__(chunk)
         self.register_buffer("frequencies", 0.1 * 2.0 ** torch.arange(frequencies), persistent=False)
         waves = 2 * 3 * frequencies
@@ -153,12 +154,12 @@ class MLPOriginal(MLPField):
 
     def __init__(
         self,
-        width: int = 256,
-        depth: int = 8,
+        width: Positive = 256,
+        depth: Positive = 8,
         skip: int | None = 4,
-        frequencies: int = 10,
-        direction_frequencies: int = 4,
-        noise_std: float = 0.0,
+        frequencies: Count = 10,
+        direction_frequencies: Count = 4,
+        noise_std: Amount = 0.0,
         normalize: bool = True,
         chunk: int = 1 << 15,
     ) -> None:

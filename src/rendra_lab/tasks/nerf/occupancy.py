@@ -19,6 +19,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
 from rendra_lab.networks.sizes import take_sizes
 from rendra_lab.number_checks import check_at_least, check_shares
+from rendra_lab.settings import Count, Fraction
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 
@@ -61,10 +62,10 @@ class OccupancyRenderer(RayRenderer):
         cells: int = 64,
         steps_across: int = 256,
         refresh_every: int = 16,
-        empty_from: int = 100,
-        empty_below: float = 0.01,
-        decay: float = 0.8,
-        stop_below: float = 1e-3,
+        empty_from: Count = 100,
+        empty_below: Fraction = 0.01,
+        decay: Fraction = 0.8,
+        stop_below: Fraction = 1e-3,
         looks_first: bool = False,
         jitter: bool = True,
         rays_at_once: int = 65536,

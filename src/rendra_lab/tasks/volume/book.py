@@ -16,6 +16,7 @@ from rendra_lab.data.ray_views import Scene
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 from rendra_lab.number_checks import check_above_zero, check_at_least
+from rendra_lab.settings import Positive, Size
 
 
 class BookVolume(nn.Module):
@@ -38,9 +39,9 @@ class BookVolume(nn.Module):
 
     def __init__(
         self,
-        voxels: int = 128,
-        side: float = 3.0,
-        samples: int = 150,
+        voxels: Positive = 128,
+        side: Size = 3.0,
+        samples: Positive = 150,
         depth_range: Sequence[float] = (0.1, 3.0),
         start: float = -4.0,
         rays_at_once: int = 65536,

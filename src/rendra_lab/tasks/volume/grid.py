@@ -22,6 +22,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 from rendra_lab.networks.sizes import take_sizes
 from rendra_lab.number_checks import check_above_zero, check_at_least, check_shares
+from rendra_lab.settings import Fraction
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
 _SHORTEST = 1e-9  # step of a ray without length, as a share of others
@@ -79,8 +80,8 @@ class VolumeGrid(nn.Module):
         voxels: Sequence[int] = (48, 96, 160),
         steps_per_voxel: float = 2.0,
         start_density: float = 0.05,
-        empty_below: float = 1e-3,
-        stop_below: float = 1e-3,
+        empty_below: Fraction = 1e-3,
+        stop_below: Fraction = 1e-3,
         rays_at_once: int = 65536,
     ) -> None:
         super().__init__()
