@@ -85,10 +85,10 @@ class LedgerLauncher(Launcher):
         alone: set[str] = set()  # jobs whose process vanished: run again, each by itself
         waited = False
         while True:
-            states = {key: state for key, state in ledger.states().items() if key in jobs}
+            states = ledger.states()
             if self._job.stopped(states):
                 return
-            open_jobs = {key: state for key, state in states.items() if not self._is_over(state)}
+            open_jobs = {key: states[key] for key in jobs if not self._is_over(states[key])}
             free = {key: ledger.free_after(state) for key, state in open_jobs.items()}
             ready = [key for key, after in free.items() if after is not None]
             if ready:
@@ -130,8 +130,10 @@ class LedgerLauncher(Launcher):
                 if len(jobs) == 1:
                     reason = "its process was killed, or ran out of memory"
                     ledger.append("failed", job=state.key, claim=last, error=reason)
-        if broken is not None and not vanished and len(ledger.events()) == before:
-            raise broken
+        if len(ledger.events()) == before:
+            if broken is not None:
+                raise broken
+            time.sleep(_POLL_S)  # others were faster with every job
         return vanished
 
     def _answer(self, state: JobState) -> JobReturn:

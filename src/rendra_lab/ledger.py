@@ -19,6 +19,7 @@ import json
 import os
 import platform
 import re
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -220,13 +221,21 @@ class Claim:
                 self._beat(count)
             if successor.exists():
                 self.lost = True
-                _thread.interrupt_main()
+                _interrupt_main_thread()
                 return
 
     def _beat(self, count: int) -> None:
         os.lseek(self._file, 0, os.SEEK_SET)
         os.write(self._file, f"{count:012d}\n{self._holder}\n".encode())
         os.fsync(self._file)
+
+
+def _interrupt_main_thread() -> None:
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
+        signal.pthread_kill(main, signal.SIGINT)  # also out of a sleep
+    else:
+        _thread.interrupt_main()
 
 
 def _write_line(file: int, event: str, fields: Event) -> None:

@@ -179,7 +179,7 @@ class SweepJob:
             from rendra_lab.checkpoints import newest_checkpoint
 
             try:
-                cfg.ckpt_path = str(newest_checkpoint(folder))
+                cfg.ckpt_path = str(newest_checkpoint(folder).path)
             except UserError as error:
                 log.warning("the job begins anew: %s", error)
 
