@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from rendra_lab.data.repeated import StepByStep
 from rendra_lab.data.shares import Share
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
+from rendra_lab.settings import Count, Fraction, Positive, Range
 
 RayWarp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Takes rays, origins (Q, 3) and unit directions (Q, 3), to those of a bent space: the same shapes and lengths."""
@@ -273,14 +274,14 @@ class SceneViews(LightningDataModule, ABC):
 
     def __init__(
         self,
-        rays_per_step: int = 4096,
+        rays_per_step: Positive = 4096,
         rays_per_pixel_side: int | Sequence[Sequence[int]] = 1,
         background: str = "white",
         views_per_step: int | None = None,
-        precrop: float = 1.0,
-        precrop_steps: int = 0,
+        precrop: Annotated[float, Range(0, 1, closed=False)] = 1.0,
+        precrop_steps: Count = 0,
         jitter: bool = False,
-        focus: float = 0.0,
+        focus: Fraction = 0.0,
         seed: int = 0,
         steps: int = 100_000,
     ) -> None:
