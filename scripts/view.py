@@ -123,48 +123,50 @@ def _exported(folder: Path) -> list[Path]:
     return [chosen[stem] for stem in sorted(chosen)]
 
 
-def _server(port: int, page: bytes) -> ThreadingHTTPServer:
-    """A server on this machine alone, of this page alone."""
+class _Answer(BaseHTTPRequestHandler):
+    """Answers / with the server's page, and anything else with 404."""
 
-    class Page(BaseHTTPRequestHandler):
-        """Answers / with the page, and anything else with 404."""
+    server: _PageServer
+    server_version, sys_version = "rendra", ""
 
-        server_version, sys_version = "rendra", ""
+    def do_GET(self) -> None:
+        # a page of another site that resolves its own name to this machine sends that name
+        name = self.headers.get("Host", "").partition(":")[0]
+        known = name in (HOST, "localhost") and self.path.partition("?")[0] == "/"
+        body = self.server.page if known else b"There is nothing here but /\n"
+        self.send_response(200 if known else 404)
+        self.send_header("Content-Type", f"text/{'html' if known else 'plain'}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(body)
 
-        def do_GET(self) -> None:
-            self._answer(self.command == "GET")
+    do_HEAD = do_GET
 
-        do_HEAD = do_GET
+    def log_message(self, format: str, *args: Any) -> None:
+        """Says nothing: requests are not news."""
 
-        def _answer(self, with_body: bool) -> None:
-            # a page of another site that resolves its own name to this machine sends that name
-            name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-            known = name in (HOST, "localhost") and self.path.split("?")[0] == "/"
-            body = page if known else b"There is nothing here but /\n"
-            self.send_response(200 if known else 404)
-            self.send_header("Content-Type", f"text/{'html' if known else 'plain'}; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.end_headers()
-            if with_body:
-                self.wfile.write(body)
 
-        def log_message(self, format: str, *args: Any) -> None:
-            """Says nothing: requests are not news."""
+class _PageServer(ThreadingHTTPServer):
+    """Serves one page on this machine alone; ends at once, and is silent about browsers that hang up."""
 
-    class Server(ThreadingHTTPServer):
-        """Ends at once, and is silent about browsers that hang up."""
+    daemon_threads = True
+    allow_reuse_address = os.name != "nt"
 
-        daemon_threads = True
-        allow_reuse_address = os.name != "nt"
+    def __init__(self, port: int, page: bytes) -> None:
+        self.page = page
+        super().__init__((HOST, port), _Answer)
 
-        def handle_error(self, request: Any, client_address: Any) -> None:
-            if not isinstance(sys.exc_info()[1], ConnectionError):
-                super().handle_error(request, client_address)
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
 
+
+def _server(port: int, page: bytes) -> _PageServer:
     try:
-        return Server((HOST, port), Page)
+        return _PageServer(port, page)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise OSError(f"port {port} is taken; leave --port out for a free one") from None

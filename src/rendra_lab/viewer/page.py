@@ -25,6 +25,8 @@ def viewer_assets() -> tuple[str, str]:
     """The text of the style sheet and of the program, for a `<style>` and a `<script>` of the same page.
 
     The program defines `RendraViewer.mount(element, payload, options)` and no other name. Neither text holds "</".
+    Options, each of which may be left out: `yaw` and `pitch` of the first view in degrees; `background`, "light",
+    "white", "grey" or "dark"; `controls`, false for none. The element takes its height from the page's own style.
     """
     parts = [(_ASSETS / name).read_text(encoding="utf-8") for name in _SOURCES]
     program = '(function () {\n"use strict";\n' + "\n".join(parts) + "\n})();\n"

@@ -5,6 +5,8 @@ const PALETTE = [
   [0.80, 0.50, 0.76], [0.90, 0.76, 0.30], [0.42, 0.76, 0.73], [0.88, 0.46, 0.47],
 ];
 const BACKGROUNDS = { light: [0.96, 0.965, 0.975], white: [1, 1, 1], grey: [0.45, 0.47, 0.5], dark: [0.09, 0.1, 0.12] };
+const AXES_SIDE = 84;  // pixels of the corner where the axes are drawn
+const AXIS_COLORS = [[0.86, 0.22, 0.2], [0.2, 0.62, 0.24], [0.2, 0.4, 0.9]];
 const POSITION = 0, NORMAL = 1, COLOR = 2, UV = 3;
 const PICK_WINDOW = 9;  // pixels on a side in which a double click looks for something
 

@@ -1,7 +1,5 @@
 // The controls over the canvas. Text goes in as text: a name in a payload is never read as HTML.
 
-const AXES_SIDE = 84;  // pixels of the corner where the axes are drawn
-const AXIS_COLORS = [[0.86, 0.22, 0.2], [0.2, 0.62, 0.24], [0.2, 0.4, 0.9]];
 const KEYS = [
   ["drag", "turn"], ["right drag, shift + drag", "shift"], ["wheel, pinch", "zoom"],
   ["double click", "look at this place"], ["R", "first view"], ["E", "edges"], ["F", "faces"], ["S", "flat or smooth"],
