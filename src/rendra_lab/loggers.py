@@ -132,9 +132,11 @@ class TensorBoard(Logger):
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Brings everything to disk; writing may go on."""
+        """Brings everything to disk; writing may go on, but after a failure in a new file."""
         if self._writer is not None:
             self._writer.flush()
+        if status == "failed":
+            self.close()
 
     @rank_zero_only
     def close(self) -> None:

@@ -195,7 +195,7 @@ def test_parts_can_be_switched_off(compose: Compose, tmp_path: Path) -> None:
     off = ["logger=csv", "callbacks=[timer]", "test=null", "optimized_metric=null"]
     assert run(compose(folder, "task=toy", "debug=fast", *off)) is None
     names = {path.name for path in folder.rglob("*")}
-    assert names == {"metrics.json", "metrics.csv"}
+    assert names == {"metrics.json", "metrics.csv", "report.html"}
 
 
 @pytest.mark.parametrize("mode", ["fast", "overfit", "anomaly", "profile"])

@@ -183,6 +183,35 @@ def test_a_sweep_is_compared(tmp_path: Path) -> None:
     assert share_of(shown, BLUE) > 0.02
 
 
+def test_a_sweep_answers_the_mouse(tmp_path: Path) -> None:
+    sweep = tmp_path / "sweep"
+    for number, (lr, value) in enumerate([("0.1", 20.0), ("0.2", 31.5), ("0.4", 9.0)]):
+        make_job(sweep / str(number), lr, value)
+    text = write_sweep_report(sweep).read_text(encoding="utf-8")
+    policy = re.compile("<meta http-equiv[^>]*>")  # or the script of this test would not run
+    script = """<script>
+      const order = () => [...document.querySelectorAll("table.jobs tbody a")].map((link) => link.textContent).join();
+      const heads = [...document.querySelectorAll("table.jobs th")];
+      const head = heads.find((each) => each.textContent.startsWith("psnr"));
+      head.click(); console.log("up " + order());
+      head.click(); console.log("down " + order());
+      const svg = document.querySelector(".chart svg"), frame = svg.getBoundingClientRect();
+      svg.dispatchEvent(new PointerEvent("pointermove", { clientX: frame.right - 1, clientY: frame.top + 9 }));
+      console.log(svg.closest(".chart").querySelector("span").textContent);
+      const line = document.querySelector("#parallel-view path[data-job='2']");
+      line.dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+      console.log([...document.querySelectorAll("#parallel-view .lit")].map((each) => each.textContent).join());
+    </script>"""
+    _, said = seen(policy.sub("", text) + script, tmp_path, webgl=False)
+    last = "0.049787"
+    assert said == [
+        "up job 2,job 0,job 1",
+        "down job 1,job 0,job 2",
+        f"job 2: {last}  job 0: {last}  job 1: {last} at step 90",
+        "job 2",
+    ]
+
+
 def test_pictures_beyond_the_size_are_left_out_and_named(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run")
     noise = np.random.default_rng(0).integers(0, 255, (300, 300, 3), dtype=np.uint8)
@@ -255,6 +284,21 @@ def test_a_run_ends_with_its_report_and_names_it(train: Callable[..., tuple[int,
     told = {key: value for key, _, value in settings.told}
     assert told == {"optimizer.lr": "0.07", "trainer.max_steps": "10", "trainer.log_every_n_steps": "5", "seed": "3"}
     assert settings.implied == settings.choices == []
+
+
+def test_failed_jobs_and_their_sweep_have_reports_too(
+    train: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    code, said, _ = train("-m", "+module.fail_at=5,50", "trainer.max_steps=8", "trainer.log_every_n_steps=2")
+    assert code == 1
+    (sweep,) = [
+        path for path in tmp_path.glob("outputs/*/*/report.html") if f"report    {path.relative_to(tmp_path)}" in said
+    ]
+    statuses = [text for text in read_page(sweep).texts["span"] if text in ("ok", "failed")]
+    assert sorted(statuses) == ["failed", "failed", "ok", "ok"]  # in the heading and in the table
+    (failed,) = sweep.parent.glob("0_*/report.html")
+    assert "RuntimeError: the toy broke as told" in read_page(failed).texts["p"]
+    assert ("module.fail_at", "(absent)", "5") in read_settings(failed.parent).told
 
 
 def test_a_report_can_be_switched_off(train: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
