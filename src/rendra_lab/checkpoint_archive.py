@@ -164,27 +164,36 @@ def _walk(path: Path, file: BinaryIO, checksums: bool) -> Any:
 
 
 def _members(path: Path, archive: zipfile.ZipFile, size: int) -> tuple[dict[str, int], str]:
-    """The bytes of each tensor's member by key, and the folder of all members; sizes are held against the file's."""
+    """The bytes of each tensor's member by key, and the folder of all members.
+
+    Whatever Python's reader and torch's could take differently is refused.
+    """
     members = archive.infolist()
     for member in members:
-        if member.compress_type != zipfile.ZIP_STORED or member.compress_size != member.file_size:
-            raise CheckpointError(path, f"is refused: {member.filename} is compressed, which no checkpoint is")
-        if member.external_attr & 0xFFFF or member.volume:  # torch skips a "folder" and leaves its tensor unset
-            raise CheckpointError(path, f"is damaged: {member.filename} is marked as a folder, or of another volume")
-        if not 0 <= member.header_offset < size:
-            raise CheckpointError(path, f"is damaged: {member.filename} would lie outside of it")
+        if problem := _problem(member, size):
+            raise CheckpointError(path, f"is {problem[0]}: {member.filename} {problem[1]}")
     claimed = sum(member.file_size for member in members)
     if claimed > size:
         raise CheckpointError(path, f"is refused: its members claim {claimed:,} bytes, the file has {size:,}")
     sizes = {member.filename: member.file_size for member in members}
-    tops = {name.partition("/")[0] for name in sizes}
-    prefix = next(iter(tops), "")
-    if len(sizes) < len(members) or len(tops) != 1 or f"{prefix}/data.pkl" not in sizes:
+    prefix = next(iter(sizes), "").partition("/")[0]
+    start = f"{prefix}/data/"
+    if f"{prefix}/data.pkl" not in sizes or not all(name.startswith(f"{prefix}/") for name in sizes):
         raise CheckpointError(path, "is no checkpoint: its members are others")
+    if len({name.lower() for name in sizes}) < len(members) or min(member.header_offset for member in members) > 0:
+        raise CheckpointError(path, "is refused: it holds several archives, or members of the same name")
     if sizes[f"{prefix}/data.pkl"] > _LARGEST_DESCRIPTION:
         raise CheckpointError(path, f"is refused: data.pkl is larger than {_LARGEST_DESCRIPTION:,} bytes")
-    start = f"{prefix}/data/"
     return {name[len(start) :]: count for name, count in sizes.items() if name.startswith(start)}, prefix
+
+
+def _problem(member: zipfile.ZipInfo, size: int) -> tuple[str, str] | None:
+    """What no member of a checkpoint is, in a file of `size` bytes."""
+    if member.compress_type != zipfile.ZIP_STORED or member.compress_size != member.file_size:
+        return "refused", "is compressed, which no checkpoint is"
+    if member.external_attr & 0xFFFF or member.volume:  # torch skips a "folder" and leaves its tensor unset
+        return "damaged", "is marked as a folder, or of another volume"
+    return None if 0 <= member.header_offset < size else ("damaged", "would lie outside of it")
 
 
 def _check_sums(path: Path, archive: zipfile.ZipFile) -> None:

@@ -268,6 +268,18 @@ def test_members_that_share_their_bytes_are_refused(path: Path) -> None:
         read_checkpoint(path)
 
 
+def test_what_two_readers_could_read_differently_is_refused(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(bytes(100) + content)
+    with pytest.raises(CheckpointError, match="it holds several archives"):
+        read_checkpoint(path)
+    path.write_bytes(content)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(archive.namelist()[0].upper().replace("GOOD", "good").replace("ARCHIVE", "archive"), b"")
+    with pytest.raises(CheckpointError, match="members of the same name"):
+        read_checkpoint(path)
+
+
 def test_a_member_marked_as_a_folder_is_refused(path: Path) -> None:
     """One flipped bit; torch would leave the memory of that tensor as it was."""
     content = bytearray(path.read_bytes())
