@@ -98,7 +98,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     task = instantiate(cfg.module, _convert_="all", **shared)
     settings: dict[str, Any] = dict(_ALONE)
     if observers:
-        callbacks = [LogKeeper(), *_parts(cfg.callbacks), RandomState()]
+        callbacks = [RandomState(), LogKeeper(), *_parts(cfg.callbacks)]
         for guard in (callback for callback in callbacks if isinstance(callback, NanGuard)):
             guard.config = OmegaConf.to_yaml(cfg, resolve=True)
         settings = {

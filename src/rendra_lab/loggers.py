@@ -20,8 +20,8 @@ class LogKeeper(Callback):
     """Keeps the logs of a run in step with its checkpoints, so that a resumed run goes on where it was cut off.
 
     A checkpoint brings to disk whatever was logged before. The first step of a fit cuts from the logs that lie in
-    the run's folder what an ended process logged from that step on. Every run that has loggers has it, as the first
-    of its callbacks.
+    the run's folder what an ended process logged from that step on. Every run that has loggers has it, before all
+    callbacks that show something.
     """
 
     def __init__(self) -> None:

@@ -107,8 +107,9 @@ def seeded(*key: int) -> Iterator[None]:
 class RandomState(Callback):
     """Keeps the random state in checkpoints, and the data position where the last finished step left it.
 
-    Every run that writes checkpoints has it, as the last of its callbacks that save nothing. In a run of several
-    processes each has its own streams again, if there are as many as before.
+    Every run that writes checkpoints has it, as the first of its callbacks: what fails in another one at the end of
+    a step fails after the note was made. In a run of several processes each has its own streams again, if there are
+    as many as before.
     """
 
     def __init__(self) -> None:
