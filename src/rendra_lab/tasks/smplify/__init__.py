@@ -1,0 +1,1 @@
+"""SMPLify: a body fitted to the joints of a picture."""

@@ -1,0 +1,58 @@
+"""What SMPLify is given and what it answers.
+
+Letters: N fits (a person may be fitted twice, from both sides), B people, K = 14 joints of the picture in LSP's order,
+J joints of the body, C betas, V vertices, S spheres.  Pixels: x right, y down, the middle of the first pixel at 0.5.
+World: OpenCV's camera axes, x right, y down, z forward, metres; the camera stands at the origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rendra_lab.records import TensorRecord
+
+LSP_JOINTS = (
+    "right_ankle", "right_knee", "right_hip", "left_hip", "left_knee", "left_ankle", "right_wrist", "right_elbow",
+    "right_shoulder", "left_shoulder", "left_elbow", "left_wrist", "neck", "head_top",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BodyTruth(TensorRecord):
+    """The bodies themselves, where they are known."""
+
+    pose: Float[Tensor, "B J*3"]  # rotation vectors, the first one into the camera's axes
+    betas: Float[Tensor, "B C"]
+    translation: Float[Tensor, "B 3"]
+    joints: Float[Tensor, "B J 3"]
+    verts: Float[Tensor, "B V 3"]
+    clean_px: Float[Tensor, "B K 2"]  # the joints of the picture without noise
+
+
+@dataclass(frozen=True)
+class PeopleBatch(TensorRecord):
+    """People in pictures, one each: all of a data set, fitted side by side."""
+
+    joints_px: Float[Tensor, "B K 2"]
+    confidence: Float[Tensor, "B K"]  # 0: not found, and joints_px means nothing
+    size_px: Float[Tensor, "B 2"]  # height and width of the picture
+    focal_px: Float[Tensor, " B"]
+    center_px: Float[Tensor, "B 2"]  # principal point, x and y
+    pictures: tuple[str, ...]  # what each picture is called: a path, or a name where there is none
+    truth: BodyTruth | None = None
+
+
+@dataclass(frozen=True)
+class FitPrediction(TensorRecord):
+    """Bodies as they are fitted now."""
+
+    pose: Float[Tensor, "N J*3"]
+    betas: Float[Tensor, "N C"]
+    translation: Float[Tensor, "N 3"]
+    joints_px: Float[Tensor, "N K 2"]
+    spheres: Float[Tensor, "N S 3"]  # middles of the balls that fill the body, in the world
+    person: Int[Tensor, " N"]  # whose fit this is
+    is_flipped: Bool[Tensor, " N"]  # begun with the back to the camera instead of the front, or the other way round
