@@ -20,7 +20,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rendra_lab import signals
+from rendra_lab import run_names, signals  # noqa: F401 - run_names is asked by name, in conf/hydra
 from rendra_lab.errors import UserError
 from rendra_lab.origins import trusted_folders, watch_origins
 from rendra_lab.sweep import conclude_sweep
@@ -48,6 +48,7 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     atexit.register(gc.freeze)  # or the interpreter's last collection walks all that was imported, for a second
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands its exceptions over instead of printing them
     FailureKeeper.active = True
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # torch's native code warns of what is as it should be
     config_dir = Path(script).resolve().parent / config_path
     try:
         check_command_line()
@@ -58,7 +59,8 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
             raise FailureKeeper.failure
     except signals.Interrupted as stop:  # before the run, or between the runs of a sweep
         conclude_sweep()
-        sys.stderr.write(f"{Path(script).name}: {stop}\n")
+        if os.environ.get("LOCAL_RANK", "0") == "0":
+            sys.stderr.write(f"{Path(script).name}: {stop}\n")
         sys.exit(stop.code)
     except BrokenPipeError:  # the reader of the output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

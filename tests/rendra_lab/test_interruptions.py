@@ -53,8 +53,9 @@ def goes_on(compose: Compose, folder: Path, *overrides: str) -> None:
     metrics = record_of(resumed)["metrics"]
     assert metrics["test/psnr"] == record_of(whole)["metrics"]["test/psnr"]
     assert metrics.items() <= record_of(whole)["metrics"].items()
-    for name, weight in weights_of(whole).items():
-        assert torch.equal(weight, weights_of(resumed)[name])
+    if record_of(folder)["steps"] < STEPS:
+        for name, weight in weights_of(whole).items():
+            assert torch.equal(weight, weights_of(resumed)[name])
 
 
 def validations(folder: Path) -> dict[int, str]:
