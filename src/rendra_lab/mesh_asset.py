@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rendra.io import IO, load_obj
+from rendra.io.errors import require_file
 from rendra.renderer.mesh.textures import TexturesUV
 from rendra.structures import Meshes, Pointclouds
 
@@ -63,8 +64,7 @@ def read_asset(path: str | Path) -> Asset:
         ValueError: no format has its suffix, it holds nothing, or it is malformed (MeshFormatError).
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}{' (it is a folder)' if path.is_dir() else ''}")
+    require_file(path)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         asset = _read_obj(path) if path.suffix.lower() == ".obj" else _read_other(path)

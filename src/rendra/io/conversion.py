@@ -18,6 +18,7 @@ from rendra.io._carried_colors import atlas_as_image, colors_at_verts, normals_a
 from rendra.io._mesh_as_cloud import cloud_of_verts
 from rendra.io._obj_text import parse_obj
 from rendra.io._source import read_source
+from rendra.io.errors import require_file
 from rendra.io.obj_io import Faces, Properties, load_obj, load_objs_as_meshes
 from rendra.io.pluggable import IO
 from rendra.ops.sample_points_from_meshes import sample_points_from_meshes
@@ -152,8 +153,7 @@ def _demand_free(source: Path, target: Path, options: Conversion) -> None:
             raise ValueError(
                 f"{path}: no format has the suffix {path.suffix!r}; there are {', '.join(sorted(known))}"
             )
-    if not source.is_file():
-        raise FileNotFoundError(f"there is no file {source}{' (it is a folder)' if source.is_dir() else ''}")
+    require_file(source)
     if os.path.realpath(source) == os.path.realpath(target) or (target.exists() and target.samefile(source)):
         raise FileExistsError(f"{target} is the input itself")
     if target.is_dir():

@@ -1,4 +1,6 @@
-"""The one error that every malformed mesh, material or texture file raises."""
+"""The one error that every malformed mesh, material or texture file raises, and that of a file that is missing."""
+
+from pathlib import Path
 
 _LONGEST_QUOTE = 80
 
@@ -41,3 +43,14 @@ class MeshFormatError(ValueError):
 def _quote(text: str) -> str:
     shortened = text if len(text) <= _LONGEST_QUOTE else text[: _LONGEST_QUOTE - 3] + "..."
     return repr(shortened)
+
+
+def require_file(path: Path, what: str = "file") -> None:
+    """FileNotFoundError unless `path` is a file; it says where a folder stands in its place.
+
+    Args:
+        path: which should be there.
+        what: it is, in words, such as "mesh file".
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {what} {path}{' (it is a folder)' if path.is_dir() else ''}")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rendra.io import IO, load_obj, load_objs_as_meshes
+from rendra.io.errors import require_file
 from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures.meshes import Meshes
 from rendra.utils.ico_sphere import ico_sphere
@@ -85,8 +86,7 @@ def make_cube(device: Device = "cpu") -> Meshes:
 
 
 def _read(path: Path, device: Device) -> Meshes:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no mesh file {path}{' (it is a folder)' if path.is_dir() else ''}")
+    require_file(path, "mesh file")
     mesh = _read_obj(path, device) if path.suffix.lower() == ".obj" else IO().load_mesh(path, device=device)
     if not len(mesh.faces_packed()):
         raise UserError(f"{path} holds no faces, so there is nothing to see")
