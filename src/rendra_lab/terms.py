@@ -103,13 +103,17 @@ class LossTerm(_Term):
 
     def residuals(self, prediction: Any, batch: Any, step: int = 0) -> Tensor:
         """The vector (R,) whose squared length is the weighted term; TypeError if `fn` has none."""
+        return self.residual_rows(prediction, batch, step).reshape(-1)
+
+    def residual_rows(self, prediction: Any, batch: Any, step: int = 0) -> Tensor:
+        """`residuals` as `fn` shapes them: many problems side by side have a row each."""
         if not hasattr(self.fn, "residuals"):
             raise TypeError(f"{_name(self.fn)} is not a sum of squares: this optimizer needs terms with residuals")
         positional, keyword = self._arguments(prediction, batch)
         weight = self.weight_at(step)
         if weight < 0:
             raise ValueError(f"a sum of squares needs a weight of at least 0, got {weight}")
-        return weight**0.5 * self.fn.residuals(*positional, **keyword).reshape(-1)
+        return weight**0.5 * self.fn.residuals(*positional, **keyword)
 
 
 class MetricTerm(_Term):

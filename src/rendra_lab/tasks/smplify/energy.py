@@ -1,11 +1,13 @@
 """The terms of SMPLify's objective, each a sum of squares.
 
 Bogo et al., "Keep it SMPL: Automatic Estimation of 3D Human Pose and Shape from a Single Image", ECCV 2016.
-Letters: N fits, K joints of the picture, J joints of the body, B betas. Angles are radians; lengths in the picture are
-pixels of a picture in which the person is about as large as in the paper's (`FitBatch.enlarge`).
+Letters: N fits, K joints of the picture, J joints of the body, B betas. Angles are radians; lengths in the picture
+are pixels of one in which the person is as large as in the paper's (`PeopleBatch.enlarge`).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -21,9 +23,7 @@ class SumOfSquares(nn.Module):
         """The sum of the squares of all fits."""
         return self.residuals(*arguments, **named).square().sum()
 
-    def residuals(self, *arguments: Tensor, **named: Tensor) -> Tensor:
-        """Rows (N, R)."""
-        raise NotImplementedError
+    residuals: Callable[..., Tensor]  # rows (N, R)
 
 
 class Reprojection(SumOfSquares):

@@ -1,15 +1,13 @@
 """What poses people take: a mixture of Gaussians over the rotation vectors of a body's joints.
 
-Bogo et al., "Keep it SMPL", ECCV 2016, Sec. 3.2: the sum over the components is replaced by its largest summand, as in
-Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", 2013.
+Bogo et al., "Keep it SMPL", ECCV 2016, Sec. 3.2: the sum over the components is replaced by its largest summand
+(Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", 2013).
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,7 @@
 """What SMPLify is given and what it answers.
 
-Letters: N fits (a person may be fitted twice, from both sides), B people, K = 14 joints of the picture in LSP's order,
-J joints of the body, C betas, V vertices, S spheres.  Pixels: x right, y down, the middle of the first pixel at 0.5.
+Letters: N fits (a person may be fitted twice, from both sides), B people, K = 14 joints of the picture in LSP's
+order, J joints of the body, C betas, V vertices, S spheres.  Pixels: x right, y down, the middle of the first pixel at 0.5.
 World: OpenCV's camera axes, x right, y down, z forward, metres; the camera stands at the origin.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -18,6 +19,10 @@ LSP_JOINTS = (
     "right_ankle", "right_knee", "right_hip", "left_hip", "left_knee", "left_ankle", "right_wrist", "right_elbow",
     "right_shoulder", "left_shoulder", "left_elbow", "left_wrist", "neck", "head_top",
 )  # fmt: skip
+
+
+USUAL_HEIGHT_PX = 300.0
+"""Of a person in the pictures that the weights of Bogo et al. were chosen for: LSP's, enlarged twice."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,23 @@ class PeopleBatch(TensorRecord):
     pictures: tuple[str, ...]  # what each picture is called: a path, or a name where there is none
     truth: BodyTruth | None = None
 
+    @property
+    def height_px(self) -> Float[Tensor, " B"]:
+        """How large each person is: the longer side of the box about the joints that were found."""
+        found = (self.confidence > 0)[..., None]
+        high = torch.where(found, self.joints_px, -torch.inf).amax(1)
+        low = torch.where(found, self.joints_px, torch.inf).amin(1)
+        return (high - low).amax(1).clamp_min(1.0)
+
+    @property
+    def enlarge(self) -> Float[Tensor, " B"]:
+        """By what the paper's pictures, in which a person has about 300 pixels, are larger than this one."""
+        return USUAL_HEIGHT_PX / self.height_px
+
+    def select(self, rows: Tensor) -> PeopleBatch:
+        """The people of rows (N,), some perhaps twice."""
+        return self._map(lambda value: value.index_select(0, rows), lambda value: isinstance(value, Tensor))
+
 
 @dataclass(frozen=True)
 class FitPrediction(TensorRecord):
@@ -56,3 +78,5 @@ class FitPrediction(TensorRecord):
     spheres: Float[Tensor, "N S 3"]  # middles of the balls that fill the body, in the world
     person: Int[Tensor, " N"]  # whose fit this is
     is_flipped: Bool[Tensor, " N"]  # begun with the back to the camera instead of the front, or the other way round
+    joints: Float[Tensor, "N J 3"] | None = None  # in the world; not while it is fitted
+    verts: Float[Tensor, "N V 3"] | None = None
