@@ -1,7 +1,8 @@
 """What SMPLify is given and what it answers.
 
 Letters: N fits (a person may be fitted twice, from both sides), B people, K = 14 joints of the picture in LSP's
-order, J joints of the body, C betas, V vertices, S spheres.  Pixels: x right, y down, the middle of the first pixel at 0.5.
+order, J joints of the body, C betas, V vertices, S spheres.
+Pixels: x right, y down, the middle of the first pixel at 0.5.
 World: OpenCV's camera axes, x right, y down, z forward, metres; the camera stands at the origin.
 """
 

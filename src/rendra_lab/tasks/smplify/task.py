@@ -1,7 +1,7 @@
 """SMPLify: pose, shape and place of a body from the joints of one picture.
 
-Bogo et al., "Keep it SMPL: Automatic Estimation of 3D Human Pose and Shape from a Single Image", ECCV 2016. All people
-of a batch are fitted side by side; one step of the solver is one step of training.
+Bogo et al., "Keep it SMPL: Automatic Estimation of 3D Human Pose and Shape from a Single Image", ECCV 2016.
+All people of a batch are fitted side by side; one step of the solver is one step of training.
 """
 
 from __future__ import annotations
