@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 
 def run_name(time: str) -> str:
-    """`time`, unless torchrun or srun has started this process as one of several: then what the launcher calls them."""
+    """`time`, unless torchrun or srun started this process as one of several: then what the launcher calls them."""
     if "TORCHELASTIC_RUN_ID" in os.environ:
         word = os.environ["TORCHELASTIC_RUN_ID"]
         return (
