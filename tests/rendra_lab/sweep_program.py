@@ -11,11 +11,11 @@ import hydra
 from rendra_lab.front_door import guarded
 
 
-@hydra.main(version_base="1.3", config_path="../../conf", config_name="train")
+@hydra.main(version_base="1.3", config_path="sweep_conf", config_name="light")
 def main(cfg: Any) -> float:
     diary = Path(cfg.output_root) / "diary.txt"
     write(diary, f"start {cfg.optimizer.lr} {os.getpid()} {cfg.threads}")
-    time.sleep(cfg.get("nap", 0.0))
+    time.sleep(cfg.nap)
     with contextlib.suppress(FileNotFoundError):
         (Path(cfg.output_root) / f"doom {cfg.optimizer.lr}").unlink()
         raise RuntimeError("broke as told")
@@ -30,4 +30,4 @@ def write(path: Path, line: str) -> None:
 
 
 if __name__ == "__main__":
-    guarded(main, __file__, config_path="../../conf", config_name="train")
+    guarded(main, __file__, config_path="sweep_conf", config_name="light")

@@ -13,15 +13,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from rendra_lab_toy import ToyTask
 
+from rendra_lab import origins
 from rendra_lab.sweep import collect, job_folder
 
 HERE = Path(__file__).parent
 LIGHT = str(HERE / "sweep_program.py")  # without torch: a second, not ten
 SEARCH = f"hydra.searchpath=[file://{HERE / 'conf'}]"
+ENVIRONMENT = {
+    "RENDRA_CONF": str(HERE.parents[1] / "conf"),  # where the light program finds the launchers and searches
+    "RENDRA_LAB_CONFIGS": str(HERE.parents[1] / "conf"),
+    "RENDRA_LAB_PACKAGES": "rendra_lab_toy,rendra_lab_diary",
+}
 TRAIN = str(HERE.parents[1] / "train.py")
-QUICK_HEART = ["sweep.heartbeat_s=0.2", "sweep.stale_s=2"]
 
 
 class Sweeps:
@@ -32,12 +38,8 @@ class Sweeps:
         self.started: list[subprocess.Popen] = []
 
     def start(self, *arguments: str, program: str = LIGHT) -> subprocess.Popen:
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(HERE.parent),
-            "RENDRA_LAB_PACKAGES": "rendra_lab_toy,rendra_lab_diary",
-        }
-        command = [sys.executable, program, "-m", "task=toy", SEARCH, *QUICK_HEART, *arguments]
+        environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(HERE.parent)}
+        command = [sys.executable, program, "-m", *arguments]
         said = (self.folder / f"said_{len(self.started)}.txt").open("w")
         with said:
             process = subprocess.Popen(
@@ -68,7 +70,7 @@ class Sweeps:
 
     @property
     def sweep(self) -> Path:
-        (found,) = (path for path in (self.folder / "outputs" / "toy").iterdir())
+        (found,) = (path for path in (self.folder / "outputs").glob("*/*"))
         return found
 
     def events(self) -> list[dict[str, Any]]:
@@ -82,10 +84,14 @@ Here = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def here(program: Here) -> Here:
+def here(program: Here, monkeypatch: pytest.MonkeyPatch) -> Here:
     """Runs a sweep of the light program in this process; answers its exit code, stdout and stderr."""
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(origins, "_trusted", set())  # this program's folder is no other's
+    monkeypatch.setattr(ConfigLoaderImpl, "_load_single_config", ConfigLoaderImpl._load_single_config)
     light = str(Path(LIGHT).relative_to(HERE.parents[1]))
-    return lambda *arguments: program(light, "-m", "task=toy", SEARCH, *QUICK_HEART, *arguments)
+    return lambda *arguments: program(light, "-m", *arguments)
 
 
 @pytest.fixture
@@ -110,13 +116,13 @@ def each_once(lines: Sequence[Sequence[str]], count: int) -> bool:
 def test_a_killed_sweep_goes_on_where_it_was(sweeps: Sweeps, count: int) -> None:
     """The parent dies in the fifth of twelve jobs, and a worker of the second attempt too."""
     at = 5 if count == 12 else 2
-    killed = sweeps.start(rates(count), "+nap=0.3")
+    killed = sweeps.start(rates(count), "nap=0.3")
     sweeps.wait_for("start", at)
     killed.kill()
     killed.wait()
     assert sweeps.statuses() == Counter(ok=at - 1, interrupted=1, waiting=count - at)
 
-    helped = sweeps.start(rates(count), "+nap=0.3", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    helped = sweeps.start(rates(count), "nap=0.3", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     sweeps.wait_for("start", at + 2)
     os.kill(int(sweeps.diary("start")[-1][1]), signal.SIGKILL)
     assert helped.wait(timeout=90) == 0, sweeps.said()
@@ -132,7 +138,7 @@ def test_a_killed_sweep_goes_on_where_it_was(sweeps: Sweeps, count: int) -> None
     assert [len((folder / "mark").read_text().splitlines()) for folder in folders] == [1] * count
     assert f"{count} runs" in sweeps.said()
     if count == 12:
-        code, said = sweeps.run(rates(count), "+nap=0.3", "hydra/launcher=joblib")
+        code, said = sweeps.run(rates(count), "nap=0.3", "hydra/launcher=joblib")
         assert code == 0
         assert "12 jobs, 12 of them done" in said
         assert len(sweeps.diary("end")) == 12
@@ -140,7 +146,7 @@ def test_a_killed_sweep_goes_on_where_it_was(sweeps: Sweeps, count: int) -> None
 
 @pytest.mark.parametrize("count", [4, pytest.param(12, marks=pytest.mark.slow)])
 def test_two_parents_drain_one_sweep(sweeps: Sweeps, count: int) -> None:
-    both = [sweeps.start(rates(count), "+nap=0.2") for _ in range(2)]
+    both = [sweeps.start(rates(count), "nap=0.2") for _ in range(2)]
     assert [process.wait(timeout=90) for process in both] == [0, 0], sweeps.said()
     assert each_once(sweeps.diary("end"), count)
     assert each_once(sweeps.diary("start"), count)
@@ -150,7 +156,7 @@ def test_two_parents_drain_one_sweep(sweeps: Sweeps, count: int) -> None:
 
 
 def test_an_interrupted_sweep_prints_its_table(sweeps: Sweeps) -> None:
-    stopped = sweeps.start(rates(3), "+nap=1")
+    stopped = sweeps.start(rates(3), "nap=1")
     sweeps.wait_for("start", 2)
     stopped.send_signal(signal.SIGINT)
     assert stopped.wait(timeout=30) == 130, sweeps.said()
@@ -160,7 +166,7 @@ def test_an_interrupted_sweep_prints_its_table(sweeps: Sweeps) -> None:
 
 
 def test_processes_of_submitit_may_die(sweeps: Sweeps) -> None:
-    parent = sweeps.start(rates(2), "+nap=1", "hydra/launcher=submitit_local")
+    parent = sweeps.start(rates(2), "nap=1", "hydra/launcher=submitit_local")
     sweeps.wait_for("start", 2)
     os.kill(int(sweeps.diary("start")[0][1]), signal.SIGKILL)
     assert parent.wait(timeout=90) == 0, sweeps.said()
@@ -171,7 +177,7 @@ def test_processes_of_submitit_may_die(sweeps: Sweeps) -> None:
 
 
 def test_a_search_goes_on_and_further(sweeps: Sweeps) -> None:
-    search = ["hparams_search=optuna", "direction=minimize", "+nap=0.2"]
+    search = ["hparams_search=optuna", "nap=0.2"]
     killed = sweeps.start(*search, "hydra.sweeper.n_trials=3")
     sweeps.wait_for("start", 2)
     killed.kill()
@@ -223,14 +229,14 @@ def test_a_sweep_can_begin_anew(sweeps: Sweeps, here: Here) -> None:
     first = sweeps.sweep
     assert here("sweep.fresh=true", "optimizer.lr=0.01,0.02")[0] == 0
     assert here("optimizer.lr=0.010,0.020")[0] == 0  # the newest of its folders
-    folders = sorted(path.name for path in (sweeps.folder / "outputs" / "toy").iterdir())
+    folders = sorted(path.name for path in (sweeps.folder / "outputs" / "light").iterdir())
     assert folders == [first.name, f"{first.name}_2"]
     assert re.fullmatch(r"sweep_optimizer\.lr=0\.01-0\.02_[0-9a-f]{8}", first.name)
     assert [line[0] for line in sweeps.diary("start")] == ["0.01", "0.02"] * 2
 
 
 def test_an_explicit_folder_takes_more_jobs_and_overwrites_none(sweeps: Sweeps, here: Here) -> None:
-    there = "hydra.sweep.dir=outputs/toy/mine"
+    there = "hydra.sweep.dir=outputs/light/mine"
     assert here("optimizer.lr=0.01,0.02", there)[0] == 0
     assert here("optimizer.lr=0.03,0.02", there)[0] == 0
     names = sorted(path.name for path in sweeps.sweep.iterdir() if path.name[0].isdigit())
@@ -304,7 +310,15 @@ def test_names_of_folders_are_harmless() -> None:
 @pytest.mark.slow
 def test_a_killed_sweep_of_a_task_goes_on_where_it_was(sweeps: Sweeps) -> None:
     """As above with real runs: twelve toys on joblib, parent killed at the fifth, then a worker."""
-    command = [rates(12), "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "trainer.max_steps=400", "logger=csv"]
+    command = [
+        "task=toy",
+        SEARCH,
+        rates(12),
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "trainer.max_steps=400",
+        "logger=csv",
+    ]
     command += [
         "callbacks=[checkpoint]",
         "module._target_=rendra_lab_diary.DiaryToy",
