@@ -226,7 +226,7 @@ def test_a_slurm_job_that_cannot_be_requeued_says_so(scontrol: Path, tmp_path: P
 def start(folder: Path, *overrides: str) -> subprocess.Popen:
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "tests"), "RENDRA_LAB_PACKAGES": "rendra_lab_toy"}
     search = f"hydra.searchpath=[file://{Path(__file__).parent / 'conf'}]"
-    command = [sys.executable, str(REPOSITORY / "train.py"), "task=toy", search, *overrides]
+    command = [sys.executable, str(REPOSITORY / "train.py"), *overrides, "task=toy", search]
     with (folder / "said").open("w") as said:
         return subprocess.Popen(
             command, cwd=folder, env=environment, stdout=said, stderr=said, start_new_session=True
