@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from torch.utils.tensorboard import FileWriter, SummaryWriter
 log = logging.getLogger(__name__)
 
 _FLUSH_EVERY_S = 10.0
+_MOST_BYTES = 1 << 20  # that wait in memory
 _FORMAT = "brain.Event:2"
 
 
@@ -62,50 +63,42 @@ class _Events(FileWriter):
 
 
 class _EventFile:
-    """One event file, as TensorBoard's `EventFileWriter`, but patient."""
+    """One event file, as TensorBoard's `EventFileWriter`; open only while something is brought to disk."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._records: RecordWriter | None = None
+        name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
+        self._path = folder / name
+        self._waiting = io.BytesIO()
         self._next_flush = 0.0
-        self._attempt(self._open)
+        self._is_broken = False
+        self.add_event(Event(wall_time=time.time(), file_version=_FORMAT))
 
     def get_logdir(self) -> str:
         """The folder."""
-        return str(self._folder)
+        return str(self._path.parent)
 
     def add_event(self, event: Event) -> None:
         """Writes an event; it reaches the disk within ten seconds of the next one, or by `flush`."""
-        if self._records is not None:
-            self._attempt(lambda: self._write(event))
+        if self._is_broken:
+            return
+        RecordWriter(self._waiting).write(event.SerializeToString())
+        if time.monotonic() >= self._next_flush or self._waiting.tell() >= _MOST_BYTES:
+            self.flush()
 
     def flush(self) -> None:
         """Brings everything to disk."""
-        if self._records is not None:
-            self._attempt(self._records.flush)
+        self._next_flush = time.monotonic() + _FLUSH_EVERY_S
+        waiting, self._waiting = self._waiting, io.BytesIO()
+        if self._is_broken:
+            return
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("ab") as file:
+                file.write(waiting.getbuffer())
+        except OSError as problem:
+            self._is_broken = True
+            log.warning("TensorBoard's events in %s end here, the run goes on: %s", self._path.parent, problem)
 
     def close(self) -> None:
-        """Ends the file."""
-        if self._records is not None:
-            self._attempt(self._records.close)
-            self._records = None
-
-    def _open(self) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
-        self._records = RecordWriter((self._folder / name).open("xb"))
-        self._write(Event(wall_time=time.time(), file_version=_FORMAT))
-
-    def _write(self, event: Event) -> None:
-        assert self._records is not None
-        self._records.write(event.SerializeToString())
-        if time.monotonic() >= self._next_flush:
-            self._records.flush()
-            self._next_flush = time.monotonic() + _FLUSH_EVERY_S
-
-    def _attempt(self, action: Callable[[], Any]) -> None:
-        try:
-            action()
-        except OSError as problem:
-            self._records = None
-            log.warning("TensorBoard's events in %s end here, the run goes on: %s", self._folder, problem)
+        """Brings everything to disk."""
+        self.flush()

@@ -131,6 +131,11 @@ class RandomState(Callback):
         if self._resumes_with:
             states, self._resumes_with = self._resumes_with, None
             Streams.from_plain(states[trainer.global_rank % len(states)]).restore(self._generators)
+            # once, before it fetches the first batch, Lightning makes the iterators of a validation that is done
+            validation: Any = trainer.fit_loop.epoch_loop.val_loop
+            validation.increment_progress_to_evaluation_end = untouched()(
+                validation.increment_progress_to_evaluation_end
+            )
         self._keep(trainer)
 
     def on_train_batch_end(
