@@ -34,9 +34,11 @@ class Range:
 
     def __str__(self) -> str:
         if math.isinf(self.most):
-            return f"{'of at least' if self.closed else 'above'} {self.least:g}"
+            return f"{'of at least' if self.closed else 'above'} {self.least:.10g}"
         return (
-            f"from {self.least:g} to {self.most:g}" if self.closed else f"above {self.least:g}, at most {self.most:g}"
+            f"from {self.least:.10g} to {self.most:.10g}"
+            if self.closed
+            else f"above {self.least:.10g}, at most {self.most:.10g}"
         )
 
 
@@ -53,6 +55,8 @@ _NAMES: dict[Any, str] = {
     str: "text",
     Path: "a path",
 }
+
+_OBJECT, _MAPPING = "an object with a _target_", "a mapping such as {name: value}"
 
 # What a run is told besides its parts: the top level of conf/train.yaml.
 _TOP: dict[str, Any] = {
@@ -146,7 +150,9 @@ def check_value(value: Any, hint: Any, key: str) -> None:
     """Refuses one value that its annotation excludes."""
     if _fits(value, hint):
         return
-    wanted = " or ".join(dict.fromkeys(_wanted(hint, ranges=_is_number(value))))
+    words = list(dict.fromkeys(_wanted(hint, ranges=_is_number(value))))
+    simple = [word for word in words if word not in (_OBJECT, _MAPPING)]
+    wanted = " or ".join(simple if set(simple) - {"null"} else words)
     advice = f"; quote it twice: {key}='\"{value}\"'" if wanted.startswith("text") and _is_number(value) else ""
     raise UserError(f"{key} must be {wanted}, got {_shown(value)}{advice}")
 
@@ -200,7 +206,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    text = repr(value)
+    text = str(value).lower() if isinstance(value, bool) else "null" if value is None else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -247,7 +253,7 @@ def _fits_plain(value: Any, hint: Any) -> bool:
         return isinstance(value, list)
     if hint is dict:
         return isinstance(value, Mapping)
-    if isinstance(hint, type) and isinstance(value, bool | int | float | str):
+    if isinstance(hint, type) and isinstance(value, bool | int | float | str | list):
         with contextlib.suppress(TypeError):
             return isinstance(value, hint)
     return hint is not type(None)  # whoever takes it knows what it can do with the value
@@ -276,9 +282,9 @@ def _wanted(hint: Any, ranges: bool) -> Iterator[str]:
     elif origin is not None and isinstance(origin, type) and issubclass(origin, Sequence):
         yield _listed(arguments, ranges)
     elif origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
-        yield "a mapping such as {name: value}"
+        yield _MAPPING
     else:
-        yield _NAMES.get(hint, "a list" if hint in (list, tuple) else "an object with a _target_")
+        yield _NAMES.get(hint, "a list" if hint in (list, tuple) else _OBJECT)
 
 
 def _listed(arguments: tuple[Any, ...], ranges: bool) -> str:
