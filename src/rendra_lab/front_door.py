@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.utils import JobReturn, JobStatus
-from hydra.errors import HydraException, InstantiationException, MissingConfigException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException, OverrideParseException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -134,14 +134,29 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
     if isinstance(error, MissingConfigException) and absent:
         options = known_options(absent[1], config_dir, config_name)
         return f"there is no {absent[1]} {absent[2]!r}; {_nearest(absent[2], options)}"
-    unknown = re.search(r"Could not override '([^'@]+)(?:@[^']*)?'", str(error))
+    unknown = re.search(r"Could not (?:override|delete from config\.) '([^'@]+)(?:@[^']*)?'", str(error))
     if unknown:
         return _explain_key(unknown[1], config_dir, config_name)
+    present = re.search(r"An item is already at '([^']+)'", str(error))
+    if present:
+        return f"there is a setting {present[1]} already: {present[1]}=... without the + in front"
     missing = re.search(r"Missing mandatory value: (\S+)", str(error))
     if missing:
         key = getattr(error, "full_key", None) or missing[1]
         return f"{key} needs a value: {key}=..."
-    return _plain(error)
+    return _explain_argument(error, config_dir) or _plain(error)
+
+
+def _explain_argument(error: Exception, config_dir: Path) -> str | None:
+    """One line about an argument that Hydra cannot read or that gives a group no choice; None for other mistakes."""
+    if isinstance(error, OverrideParseException):
+        return f"cannot read {error.override!r}: brackets and quotes come in pairs, as in 'key=[1,2]' 'key=\"a b\"'"
+    if "Config group override must be" in str(error):
+        for item in sys.argv[1:]:
+            name, _, choice = item.partition("=")
+            if name and (config_dir / name).is_dir() and (choice == "null" or choice.isdigit()):
+                return f"{name} must be one of its choices, got {choice}; see --help"
+    return None
 
 
 def mistyped_value(config_dir: Path, config_name: str) -> str | None:
@@ -197,7 +212,25 @@ def _search_path() -> list[str]:
 def _explain_key(key: str, config_dir: Path, config_name: str) -> str:
     keys = known_keys(config_dir, config_name)
     tails = [known for known in keys if known.rsplit(".", 1)[-1] == key]
+    parent, _, name = key.rpartition(".")
+    obvious = tails or difflib.get_close_matches(key, keys, 1, cutoff=0.85)
+    if not obvious and name in _parameters_of_key(parent, config_dir, config_name):
+        return f"{key} is not in the configuration, but what {parent} names takes it: +{key}=..."
     return f"there is no setting {key!r}; {_nearest(key, keys, tails)}"
+
+
+def _parameters_of_key(parent: str, config_dir: Path, config_name: str) -> list[str]:
+    """What the target under a dotted key takes; nothing where there is none. Its module is imported."""
+    from hydra import compose
+
+    chosen = [item for item in sys.argv[1:] if _chooses_group(item, config_dir)]
+    with _hydra(config_dir), contextlib.suppress(HydraException, OmegaConfBaseException):
+        target = OmegaConf.select(compose(config_name, overrides=[*_search_path(), *chosen]), f"{parent}._target_")
+        if isinstance(target, str):
+            from rendra_lab.targets import parameters_of_path
+
+            return parameters_of_path(target)
+    return []
 
 
 def _nearest(word: str, known: list[str], preferred: list[str] | None = None) -> str:
@@ -237,6 +270,9 @@ def _plain(error: Exception) -> str:
         if words.startswith(f"{key}."):
             return words
         return f"{key}.{words}" if _begins_with_parameter(words, str(error)) else f"{key}: {words}"
+    key = getattr(error, "full_key", None)
+    if isinstance(error, OmegaConfBaseException) and key:
+        return f"{key}: {str(error).splitlines()[0]}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if isinstance(error, HydraException) and lines else " ".join(lines) or type(error).__name__
 

@@ -16,6 +16,7 @@ from rendra.loss import chamfer_distance
 from rendra.loss.point_mesh_distance import point_face_distance
 from rendra.ops import knn_points
 from rendra.structures import Meshes
+from rendra_lab.settings import Amount, Size
 
 
 class SquaredError:
@@ -74,7 +75,7 @@ def huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, delta:
     return _mean(near * (size - 0.5 * near), mask)
 
 
-def pseudo_huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, scale: float = 0.1) -> Tensor:
+def pseudo_huber(prediction: Tensor, target: Tensor, mask: Tensor | None = None, scale: Size = 0.1) -> Tensor:
     """The mean of s (sqrt(1 + d^2 / s^2) - 1), d = prediction - target: d^2 / 2s near 0, |d| - s far from it."""
     squared = (prediction - target).square() / scale**2
     return _mean(scale * squared / (1 + (1 + squared).sqrt()), mask)
@@ -115,7 +116,7 @@ def cloud_to_surface(mesh: Meshes, points: Tensor) -> Tensor:
     return point_face_distance(points[0], first, triangles, first, points.shape[1], 0.0).mean()
 
 
-def surface_to_cloud(samples: Tensor, points: Tensor, spacing: Tensor, slack: float = 1.0) -> Tensor:
+def surface_to_cloud(samples: Tensor, points: Tensor, spacing: Tensor, slack: Amount = 1.0) -> Tensor:
     """How far samples of a surface are from a cloud, in squares of what exceeds a slack: a scalar.
 
     A cloud says where a surface is only up to the gaps between its points: within them the surface is free, and

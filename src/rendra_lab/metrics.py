@@ -15,6 +15,7 @@ from rendra.ops import distance_to_surface, knn_points, sample_points_from_meshe
 from rendra.structures import Meshes
 from rendra.transforms import so3_log_map
 from rendra_lab import losses
+from rendra_lab.settings import Size
 
 _PSNR_CEILING_DB = 100.0  # of two equal images
 _SURFACE_SAMPLES = 10_000  # that stand for a surface
@@ -121,7 +122,7 @@ def surface_chamfer_l1(mesh: Meshes, truth: Meshes) -> Tensor:
     return (there + back) / 2 / (high - low).norm()
 
 
-def surface_f_score(mesh: Meshes, points: Tensor, threshold: float) -> Tensor:
+def surface_f_score(mesh: Meshes, points: Tensor, threshold: Size) -> Tensor:
     """The harmonic mean of precision and recall, in [0, 1].
 
     Precision is the share of 10,000 points of the surface that are nearer than `threshold` to the cloud (1, P, 3),

@@ -22,6 +22,7 @@ from torch.optim import Optimizer
 from rendra_lab import nan_evidence, report
 from rendra_lab.base_task import BaseTask
 from rendra_lab.errors import UserError
+from rendra_lab.settings import Amount, Count, Positive
 
 log = logging.getLogger(__name__)
 
@@ -59,9 +60,9 @@ class NanGuard(Callback):
         self,
         policy: str = "stop",
         folder: str | None = None,
-        patience: int = 20,
-        max_folders: int = 3,
-        max_batch_mb: float = 512.0,
+        patience: Positive = 20,
+        max_folders: Count = 3,
+        max_batch_mb: Amount = 512.0,
     ) -> None:
         if policy not in POLICIES:
             raise UserError(f"on_nan must be {' or '.join(POLICIES)}, got {policy!r}")

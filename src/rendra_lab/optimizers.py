@@ -39,7 +39,7 @@ class LevenbergMarquardt(torch.optim.Optimizer):
     def __init__(
         self,
         params: Any,
-        lr: float = 0.5,
+        lr: Size = 0.5,
         difference: Sequence[float] = (0.2, 5e-3),
         damping: Size = 1e-2,
         tries: Positive = 4,

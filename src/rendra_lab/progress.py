@@ -12,6 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar, Timer
 
 from rendra_lab import report
+from rendra_lab.settings import Amount
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +139,7 @@ class Forecast(Callback):
         longest_min: minutes from which on a fit is worth a warning.
     """
 
-    def __init__(self, longest_min: float = 30.0) -> None:
+    def __init__(self, longest_min: Amount = 30.0) -> None:
         self.longest_min = longest_min
         self._pace = Pace()
         self._begun = (0, 0.0)

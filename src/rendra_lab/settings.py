@@ -6,6 +6,7 @@ A range stands where the parameter is born: `every_n_steps: Count`, `keep: Annot
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import math
 import re
@@ -117,6 +118,7 @@ def check_values(target: Any, node: Mapping[str, Any], key: str) -> None:
             check_value(value, hints[name], f"{key}.{name}")
 
 
+@functools.cache
 def hints_of(target: Any) -> dict[str, Any]:
     """The annotations of every parameter by name; those that cannot be read are left out."""
     known: dict[str, Any] = {}
@@ -253,7 +255,7 @@ def _fits_plain(value: Any, hint: Any) -> bool:
         return isinstance(value, list)
     if hint is dict:
         return isinstance(value, Mapping)
-    if isinstance(hint, type) and isinstance(value, bool | int | float | str | list):
+    if isinstance(hint, type) and hint is not object:
         with contextlib.suppress(TypeError):
             return isinstance(value, hint)
     return hint is not type(None)  # whoever takes it knows what it can do with the value

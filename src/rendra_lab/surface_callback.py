@@ -14,6 +14,7 @@ from rendra_lab.mesh_export import SurfaceSettings, export_surface
 from rendra_lab.metrics import surface_chamfer_l1
 from rendra_lab.networks.radiance import RadianceScene
 from rendra_lab.random_state import untouched
+from rendra_lab.settings import Positive
 
 
 class SurfaceExporter(Callback):
@@ -34,13 +35,13 @@ class SurfaceExporter(Callback):
     def __init__(
         self,
         folder: str,
-        resolution: int = 128,
+        resolution: Positive = 128,
         level: float | None = None,
         color: str | None = "vertex",
         keep: float = 0.01,
         smoothing: int = 5,
         num_faces: int | None = None,
-        texture_size: int = 1024,
+        texture_size: Positive = 1024,
         formats: Sequence[str] = ("obj", "ply", "glb"),
     ) -> None:
         self.folder = Path(folder)

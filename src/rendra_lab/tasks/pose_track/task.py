@@ -16,6 +16,7 @@ from rendra_lab.camera_starts import GivenStart, MultiStart
 from rendra_lab.data.views import ViewBatch
 from rendra_lab.networks.camera_pose import CameraPose, PosePrediction
 from rendra_lab.networks.mesh_view import MeshView
+from rendra_lab.settings import Positive
 from rendra_lab.visualization import silhouette_overlay
 
 
@@ -35,7 +36,7 @@ class PoseTrack(Task[ViewBatch, PosePrediction]):
     frame: Tensor
 
     def __init__(
-        self, scene: MeshView, pose: CameraPose, start: GivenStart | MultiStart, frames: int, **parts: Any
+        self, scene: MeshView, pose: CameraPose, start: GivenStart | MultiStart, frames: Positive, **parts: Any
     ) -> None:
         super().__init__(**parts)
         self.scene = scene
