@@ -6,11 +6,13 @@ import io
 import logging
 import os
 import socket
+import struct
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 from torch.utils.tensorboard import FileWriter, SummaryWriter
@@ -19,6 +21,7 @@ log = logging.getLogger(__name__)
 
 _FLUSH_EVERY_S = 10.0
 _MOST_BYTES = 1 << 20  # that wait in memory
+_HEAD, _TAIL = 12, 4  # bytes of a record about its content: length and checksum, checksum
 _FORMAT = "brain.Event:2"
 
 
@@ -38,12 +41,6 @@ class EventWriter(SummaryWriter):
     def __init__(self, folder: str) -> None:
         super().__init__(folder)
 
-    def purge(self, step: int) -> None:
-        """Lets readers forget what earlier files of the folder say about this step and later ones."""
-        if sum(1 for _ in Path(self.log_dir).glob("*tfevents*")) > 1:
-            start = SessionLog(status=SessionLog.START)
-            self.file_writer.add_event(Event(step=step, session_log=start), step)
-
     def add_summary(self, summary: Any, step: int | None = None) -> None:
         """Adds a summary as it is, whichever package made its class."""
         self.file_writer.add_summary(Summary.FromString(summary.SerializeToString()), step)
@@ -53,6 +50,37 @@ class EventWriter(SummaryWriter):
             self.file_writer = _Events(self.log_dir)
             self.all_writers = {self.log_dir: self.file_writer}
         return self.file_writer
+
+
+def cut_events(folder: Path, step: int) -> None:
+    """Drops from the event files of a folder what they say about this step and later ones, and its row of HPARAMS.
+
+    TensorBoard's `purge_step` leaves it to readers to forget, and not all of them do.
+    """
+    for path in folder.glob("*tfevents*"):
+        kept = io.BytesIO()
+        for event in _events(path.read_bytes()):
+            tags = [value.tag for value in event.summary.value]
+            if not tags or (event.step < step and not any(tag.startswith("_hparams_") for tag in tags)):
+                RecordWriter(kept).write(event.SerializeToString())
+        partial = path.with_name(f".cut.{os.getpid()}.tmp")  # not a name that TensorBoard reads
+        try:
+            partial.write_bytes(kept.getbuffer())
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def _events(content: bytes) -> Iterator[Event]:
+    """The events of a file; a last one that was cut off is left out."""
+    place = 0
+    while place + _HEAD <= len(content):
+        (length,) = struct.unpack_from("<Q", content, place)
+        end = place + _HEAD + length + _TAIL
+        if end > len(content):
+            return
+        yield Event.FromString(content[place + _HEAD : end - _TAIL])
+        place = end
 
 
 class _Events(FileWriter):
@@ -69,7 +97,7 @@ class _EventFile:
         name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
         self._path = folder / name
         self._waiting = io.BytesIO()
-        self._next_flush = 0.0
+        self._next_flush = time.monotonic() + _FLUSH_EVERY_S
         self._is_broken = False
         self.add_event(Event(wall_time=time.time(), file_version=_FORMAT))
 

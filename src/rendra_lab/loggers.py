@@ -108,8 +108,10 @@ class TensorBoard(Logger):
 
     @rank_zero_only
     def cut(self, step: int) -> None:
-        """Lets TensorBoard forget what earlier event files of the folder say about this step and later ones."""
-        self.experiment.purge(step)
+        """Drops what event files of the folder say about this step and later ones."""
+        from rendra_lab.event_files import cut_events
+
+        cut_events(Path(self.folder), step)
 
     @rank_zero_only
     def save(self) -> None:
