@@ -11,9 +11,12 @@ from rendra_lab.front_door import guarded
 def main(cfg: Any) -> None:
     """Write what the configuration says; heavy imports wait until here, so that `--help` answers at once."""
     from hydra.utils import instantiate
+    from omegaconf import OmegaConf
 
     from rendra_lab.data.scene_folders import check_output, write_scene
+    from rendra_lab.targets import check_targets
 
+    check_targets(OmegaConf.to_container(cfg, resolve=True))
     target = (cfg.output, cfg.format, cfg.overwrite)
     check_output(*target)
     scene = instantiate(cfg.data, _convert_="all").load()

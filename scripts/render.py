@@ -20,10 +20,13 @@ def main(cfg: Any) -> None:
 
 def _picture_of_mesh(cfg: Any, folder: Path) -> tuple[str, Path]:
     from hydra.utils import instantiate
+    from omegaconf import OmegaConf
 
     from rendra_lab import pictures
     from rendra_lab.errors import UserError
+    from rendra_lab.targets import check_targets
 
+    check_targets(OmegaConf.to_container(cfg, resolve=True))
     if (cfg.trajectory, cfg.what, cfg.elevation_deg) != ("auto", "rgb", None):
         raise UserError("trajectory, what and elevation_deg show a fitted scene: name its run with run=outputs/...")
     parts = {name: instantiate(cfg[name], _convert_="all") for name in ("camera", "light", "material", "shader")}

@@ -41,6 +41,8 @@ _ALLOWED_FUNCTIONS = (
     "torch.nn.functional",
     "torchmetrics.functional",
 )
+# Made of other parts of the tree: a complaint names those first.
+_COMPOSED = ("data", "module")
 # What runs programs and whole configurations is no part of one.
 _REFUSED = ("rendra_lab.benchmarking", "rendra_lab.experiment", "rendra_lab.front_door", "rendra_lab.sweep")
 
@@ -54,8 +56,8 @@ def check_targets(tree: Any, key: str = "") -> None:
     if isinstance(tree, Mapping):
         if "_target_" in tree:
             _check_arguments(_locate(tree["_target_"], key), tree, key)
-        for name, value in tree.items():
-            check_targets(value, f"{key}.{name}" if key else str(name))
+        for name in sorted(tree, key=lambda name: not key and name in _COMPOSED):
+            check_targets(tree[name], f"{key}.{name}" if key else str(name))
     elif isinstance(tree, list):
         for index, value in enumerate(tree):
             check_targets(value, f"{key}[{index}]")

@@ -43,7 +43,7 @@ def test_help_lists_the_groups_without_loading_torch() -> None:
         ("ckpt_path=nowhere", "ckpt_path: there is neither a checkpoint nor a run folder at nowhere"),
         ("ckpt_path=last", "there is no checkpoint under outputs/toy; start without ckpt_path"),
         ("loss.texture.weight=${nothing}", "Interpolation key 'nothing' not found"),
-        ("trainer.max_steps=many", "trainer.max_steps must be a number, got 'many'"),
+        ("trainer.max_steps=many", "trainer.max_steps must be a whole number, got 'many'"),
         ("optimizer.lr=much", "optimizer.lr must be a number, got 'much'"),
     ],
 )
@@ -89,7 +89,7 @@ def test_a_displacement_is_three_numbers(setting: str, program: Train) -> None:
     ("argument", "answer"),
     [
         ("data.name=dog", "there is no mesh 'dog'; there are cow, ico_sphere, torus, cube, or give a path"),
-        ("data.scan_points=many", "data.scan_points must be a number, got 'many'"),
+        ("data.scan_points=many", "data.scan_points must be a whole number, got 'many'"),
         ("data.noise=-1.0", "data.noise must lie between 0 and 1e+06, got -1.0"),
         ("module.samples=0", "module.samples must be at least 1, or null, got 0"),
         ("surface.levels=[12]", "module.surface: surface.levels must be at most 7, got [12]"),
