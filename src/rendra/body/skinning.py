@@ -7,11 +7,14 @@ Loper et al., "SMPL: A Skinned Multi-Person Linear Model", 2015, Eq. 2-4.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rendra.kernels.skinning import SkinWeights, reference, skin
 from rendra.transforms import axis_angle_to_matrix, rotation_6d_to_matrix
 
 
@@ -71,32 +74,84 @@ def pose_to_matrices(pose: Tensor, num_joints: int) -> Tensor:
 def pose_skeleton(rotations: Tensor, rest: Tensor, parents: Sequence[int]) -> PosedSkeleton:
     """Turns each joint of a skeleton against its parent.
 
+    Joints equally far from the root are turned at once.
+
     Args:
         rotations: (B, J, 3, 3), each joint's against its parent's; the first one turns everything.
         rest: (B, J, 3) places of the joints at rest. The root stays where it is.
         parents: (J,), -1 first; see `check_parents`.
+
+    Raises:
+        ValueError: shapes that do not fit each other, or parents that are no tree.
     """
-    turned: list[Tensor] = [rotations[:, 0]]
-    placed: list[Tensor] = [rest[:, 0]]
-    for joint in range(1, len(parents)):
-        parent = parents[joint]
-        turned.append(turned[parent] @ rotations[:, joint])
-        apart = (rest[:, joint] - rest[:, parent])[..., None]
-        placed.append(placed[parent] + (turned[parent] @ apart)[..., 0])
-    return PosedSkeleton(torch.stack(placed, dim=1), torch.stack(turned, dim=1))
+    parents = tuple(parents)
+    if rotations.shape[1:] != (len(parents), 3, 3) or rest.shape[1:] != (len(parents), 3):
+        raise ValueError(
+            f"rotations and rest of {len(parents)} joints are (B, {len(parents)}, 3, 3) and (B, {len(parents)}, 3), "
+            f"got {tuple(rotations.shape)} and {tuple(rest.shape)}"
+        )
+    order = _order(parents)
+    apart = torch.cat([rest[:, :1], rest[:, 1:] - _select(rest, order.above)], dim=1)
+    moves = torch.cat([rotations, apart[..., None]], dim=-1)  # (B, J, 3, 4), each against its parent's
+    levels = _select(moves, order.joints).split(order.sizes, dim=1)
+    chained = [levels[0]]
+    for level, slots in zip(levels[1:], order.slots, strict=True):
+        parent = _select(chained[-1], slots)
+        moved = parent[..., :3] @ level
+        chained.append(torch.cat([moved[..., :3], moved[..., 3:] + parent[..., 3:]], dim=-1))
+    posed = _select(torch.cat(chained, dim=1), order.places)
+    return PosedSkeleton(posed[..., 3], posed[..., :3])
 
 
-def linear_blend_skinning(verts: Tensor, skeleton: PosedSkeleton, rest: Tensor, weights: Tensor) -> Tensor:
+def _select(rows: Tensor, index: list[int]) -> Tensor:
+    return rows.index_select(1, torch.tensor(index, dtype=torch.long, device=rows.device))
+
+
+class _Order(NamedTuple):
+    """The joints of a skeleton by their distance from the root."""
+
+    above: list[int]  # parents of all joints but the root
+    joints: list[int]  # level after level
+    sizes: list[int]  # of the levels
+    slots: list[list[int]]  # for each level but the first, where in the level before the parents are
+    places: list[int]  # where in `joints` each joint is
+
+
+@lru_cache
+def _order(parents: tuple[int, ...]) -> _Order:
+    check_parents(parents)
+    depths = [0]
+    for parent in parents[1:]:
+        depths.append(depths[parent] + 1)
+    levels = [[j for j, depth in enumerate(depths) if depth == level] for level in range(max(depths) + 1)]
+    slots = [[before.index(parents[j]) for j in level] for before, level in pairwise(levels)]
+    joints = list(chain.from_iterable(levels))
+    return _Order(list(parents[1:]), joints, [len(level) for level in levels], slots,
+                  sorted(range(len(joints)), key=joints.__getitem__))  # fmt: skip
+
+
+def linear_blend_skinning(
+    verts: Tensor, skeleton: PosedSkeleton, rest: Tensor, weights: Tensor | SkinWeights
+) -> Tensor:
     """Vertices (B, V, 3) that follow a skeleton: each the weighted mean of where its joints would take it.
 
     Args:
         verts: (B, V, 3) at rest.
         skeleton: posed.
         rest: (B, J, 3) joints at rest.
-        weights: (V, J), not negative, of sum 1.
+        weights: of sum 1: a matrix (V, J), which gets a gradient; or those that are not zero
+            (`rendra.kernels.skinning.skin_weights`), which take a tenth of the time and get none.
     """
-    num_bodies, num_joints = rest.shape[:2]
-    shifts = skeleton.joints - (skeleton.rotations @ rest[..., None])[..., 0]
-    moves = torch.cat([skeleton.rotations, shifts[..., None]], dim=-1).reshape(num_bodies, num_joints, 12)
-    blended = (weights @ moves).reshape(num_bodies, -1, 3, 4)
-    return (blended[..., :3] @ verts[..., None])[..., 0] + blended[..., 3]
+    shifts = skeleton.joints - (skeleton.rotations * rest[..., None, :]).sum(-1)
+    moves = torch.cat([skeleton.rotations, shifts[..., None]], dim=-1)
+    if isinstance(weights, Tensor):
+        return reference.skin_dense(verts, moves, weights)
+    return skin(verts, moves, weights)
+
+
+def pose_features(rotations: Tensor) -> Tensor:
+    """What poses change shapes by: R - I of all joints but the first, row by row, (B, 9 (J - 1)).
+
+    Zero at rest (Loper et al., 2015, Eq. 9).
+    """
+    return (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)

@@ -14,8 +14,16 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from rendra.body.skinning import check_parents, linear_blend_skinning, pose_skeleton, pose_to_matrices
+from rendra.body.skinning import (
+    check_parents,
+    linear_blend_skinning,
+    pose_features,
+    pose_skeleton,
+    pose_to_matrices,
+)
+from rendra.kernels.skinning import SkinWeights, skin_weights
 from rendra.structures import Meshes
 
 SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
@@ -24,6 +32,8 @@ SMPL_JOINTS = (
     "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
 )  # fmt: skip
+
+_WEIGHT_SLACK = 0.01  # of the sum of a vertex's weights, which files round
 
 
 @dataclass(frozen=True)
@@ -70,6 +80,9 @@ class Body(NamedTuple):
 class SMPL(nn.Module):
     """The function M(beta, theta): shape and pose to vertices and joints. Differentiable, also at rest.
 
+    Its numbers are float32 until `.double()`. None is part of its state: a model comes from its file, whose licence
+    may forbid that checkpoints carry it about.
+
     Args:
         parts: of the model; checked.
 
@@ -78,13 +91,14 @@ class SMPL(nn.Module):
     """
 
     v_template: Tensor
-    shapedirs: Tensor
     J_regressor: Tensor
     weights: Tensor
     faces: Tensor
     joint_template: Tensor
     joint_shapedirs: Tensor
-    posedirs: Tensor | None
+    _blends: Tensor  # (N, or N + 9 (J - 1) with pose blend shapes; 3 V)
+    _skin_joints: Tensor
+    _skin_weights: Tensor
 
     def __init__(self, parts: BodyParts) -> None:
         super().__init__()
@@ -92,20 +106,24 @@ class SMPL(nn.Module):
         self.parents = check_parents(parts.parents)
         self.joint_names = parts.joint_names or _names(len(self.parents))
         self.head_top = int(parts.v_template[:, 1].argmax()) if parts.head_top is None else parts.head_top
-        dense = parts.J_regressor.to_dense() if parts.J_regressor.is_sparse else parts.J_regressor
+        self.num_betas = parts.shapedirs.shape[2]
+        self.has_pose_blends = parts.posedirs is not None
+        regressor = parts.J_regressor.to_dense() if parts.J_regressor.is_sparse else parts.J_regressor
+        wide = regressor.double()  # joints are linear in betas: regressed once, not at every call
+        directions = [each.flatten(0, 1) for each in (parts.shapedirs, parts.posedirs) if each is not None]
+        sparse = skin_weights(parts.weights.float())
         for name, value in {
-            "v_template": parts.v_template,
-            "shapedirs": parts.shapedirs,
-            "J_regressor": dense,
-            "weights": parts.weights,
+            "v_template": parts.v_template.float(),
+            "J_regressor": regressor.float(),
+            "weights": parts.weights.float(),
+            "faces": parts.faces.long(),
+            "joint_template": (wide @ parts.v_template.double()).float(),
+            "joint_shapedirs": torch.einsum("jv,vcn->jcn", wide, parts.shapedirs.double()).float(),
+            "_blends": torch.cat(directions, dim=1).float().T,
+            "_skin_joints": sparse.joints,
+            "_skin_weights": sparse.weights,
         }.items():
-            self.register_buffer(name, value.float().contiguous())
-        self.register_buffer("faces", parts.faces.long().contiguous())
-        posedirs = None if parts.posedirs is None else parts.posedirs.float().reshape(-1, parts.posedirs.shape[-1]).T
-        self.register_buffer("posedirs", None if posedirs is None else posedirs.contiguous())  # (9 (J - 1), 3 V)
-        wide = dense.double()  # joints are linear in betas: regressed once, not at every call
-        self.register_buffer("joint_template", (wide @ parts.v_template.double()).float())
-        self.register_buffer("joint_shapedirs", torch.einsum("jv,vcn->jcn", wide, parts.shapedirs.double()).float())
+            self.register_buffer(name, value.contiguous(), persistent=False)
 
     @classmethod
     def load(cls, path: str | Path, num_betas: int | None = None) -> SMPL:
@@ -142,9 +160,14 @@ class SMPL(nn.Module):
         return len(self.parents)
 
     @property
-    def num_betas(self) -> int:
-        """N."""
-        return self.shapedirs.shape[2]
+    def shapedirs(self) -> Tensor:
+        """(V, 3, N) what a beta of 1 adds to the template."""
+        return self._blends[: self.num_betas].T.unflatten(0, (-1, 3))
+
+    @property
+    def posedirs(self) -> Tensor | None:
+        """(V, 3, 9 (J - 1)) what each element of R - I of the joints but the first adds; None: nothing."""
+        return self._blends[self.num_betas :].T.unflatten(0, (-1, 3)) if self.has_pose_blends else None
 
     def forward(
         self, betas: Tensor | None = None, pose: Tensor | None = None, translation: Tensor | None = None
@@ -163,19 +186,30 @@ class SMPL(nn.Module):
             ValueError: shapes that do not fit the model or each other.
         """
         betas, rotations = self._inputs(betas, pose, translation)
-        shaped = self.v_template + torch.einsum("bn,vcn->bvc", betas, self.shapedirs[..., : betas.shape[1]])
-        rest = self.rest_joints(betas)
-        if self.posedirs is not None:
-            bent = rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
-            shaped = shaped + (bent.flatten(1) @ self.posedirs).reshape(len(bent), -1, 3)
-        rest, rotations = _alike(rest, rotations)
+        rest, rotations = _alike(self.rest_joints(betas), rotations)
+        verts, _ = _alike(self.rest_verts(betas, rotations), rotations)
         skeleton = pose_skeleton(rotations, rest, self.parents)
-        verts = linear_blend_skinning(shaped, skeleton, rest, self.weights)
-        joints = skeleton.joints
+        verts = linear_blend_skinning(verts, skeleton, rest, SkinWeights(self._skin_joints, self._skin_weights))
+        joints, turned = skeleton.joints, skeleton.rotations
         if translation is not None:
             verts, joints = verts + translation[:, None], joints + translation[:, None]
-        rotations = skeleton.rotations.expand(len(verts), -1, -1, -1)
-        return Body(verts, joints.expand(len(verts), -1, -1), rotations)
+            turned = turned.expand(len(verts), -1, -1, -1)
+        return Body(verts, joints, turned)
+
+    def rest_verts(self, betas: Tensor, rotations: Tensor | None = None) -> Tensor:
+        """Vertices (B, V, 3) of shapes (B, n) before a skeleton carries them.
+
+        Args:
+            betas: the others are 0.
+            rotations: (B, J, 3, 3) of each joint against its parent, whose pose blend shapes are added; None: at
+                rest, where there are none.
+        """
+        template = self.v_template.flatten()
+        if rotations is None or not self.has_pose_blends:
+            return torch.addmm(template, betas, self._blends[: betas.shape[1]]).unflatten(1, (-1, 3))
+        betas = F.pad(betas, (0, self.num_betas - betas.shape[1])).expand(len(rotations), -1)
+        blended = torch.cat([betas, pose_features(rotations)], dim=1)
+        return torch.addmm(template, blended, self._blends).unflatten(1, (-1, 3))
 
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Joints (B, J, 3) of shapes (B, n) at rest."""
@@ -197,6 +231,12 @@ class SMPL(nn.Module):
 
     def _inputs(self, betas: Tensor | None, pose: Tensor | None, translation: Tensor | None) -> tuple[Tensor, Tensor]:
         like = self.v_template
+        for name, given in {"betas": betas, "pose": pose, "translation": translation}.items():
+            if given is not None and (given.dtype, given.device) != (like.dtype, like.device):
+                raise ValueError(
+                    f"{name} must be {like.dtype} on {like.device}, as the body is, got {given.dtype} on "
+                    f"{given.device}"
+                )
         betas = like.new_zeros(1, self.num_betas) if betas is None else betas
         pose = like.new_zeros(1, self.num_joints, 3) if pose is None else pose
         if betas.ndim != 2 or betas.shape[1] > self.num_betas:
@@ -213,10 +253,10 @@ class SMPL(nn.Module):
         return betas, pose_to_matrices(pose, self.num_joints)
 
 
-def _alike(rest: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
+def _alike(points: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
     """Of as many bodies."""
-    count = len(rest) if len(rotations) == 1 else len(rotations)
-    return rest.expand(count, -1, -1), rotations.expand(count, -1, -1, -1)
+    count = len(points) if len(rotations) == 1 else len(rotations)
+    return points.expand(count, -1, -1), rotations.expand(count, -1, -1, -1)
 
 
 def _names(count: int) -> tuple[str, ...]:
@@ -225,6 +265,8 @@ def _names(count: int) -> tuple[str, ...]:
 
 def _check(parts: BodyParts) -> None:
     verts, joints = len(parts.v_template), len(parts.parents)
+    if not verts or not joints:
+        raise ValueError(f"a body has vertices and joints, got {verts} and {joints}")
     wanted: dict[str, tuple[Tensor, Sequence[int | None]]] = {
         "v_template": (parts.v_template, (verts, 3)),
         "shapedirs": (parts.shapedirs, (verts, 3, None)),
@@ -235,19 +277,27 @@ def _check(parts: BodyParts) -> None:
     if parts.posedirs is not None:
         wanted["posedirs"] = (parts.posedirs, (verts, 3, 9 * (joints - 1)))
     for name, (value, shape) in wanted.items():
-        if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
-            letters = tuple("any" if n is None else n for n in shape)
-            raise ValueError(
-                f"{name} must be {letters} for {verts} vertices and {joints} joints, got {tuple(value.shape)}"
-            )
-        dense = value.coalesce().values() if value.is_sparse else value
-        if value.is_floating_point() and not bool(dense.isfinite().all()):
-            raise ValueError(f"{name} holds numbers that are not finite")
+        _check_numbers(name, value, shape, f"for {verts} vertices and {joints} joints")
     if len(parts.faces) and not 0 <= int(parts.faces.min()) <= int(parts.faces.max()) < verts:
         raise ValueError(
             f"faces must name vertices 0 to {verts - 1}, got {int(parts.faces.min())} to {int(parts.faces.max())}"
+        )
+    sums = parts.weights.sum(1)
+    if (sums - 1).abs().max() > _WEIGHT_SLACK:
+        worst = int((sums - 1).abs().argmax())
+        raise ValueError(
+            f"weights of each vertex must have the sum 1; those of vertex {worst} have {sums[worst]:.4g}"
         )
     if parts.joint_names and len(parts.joint_names) != joints:
         raise ValueError(f"joint_names must be {joints}, got {len(parts.joint_names)}")
     if parts.head_top is not None and not 0 <= parts.head_top < verts:
         raise ValueError(f"head_top must be a vertex, 0 to {verts - 1}, got {parts.head_top}")
+
+
+def _check_numbers(name: str, value: Tensor, shape: Sequence[int | None], of_what: str) -> None:
+    if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
+        letters = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name} must be ({letters}) {of_what}, got {tuple(value.shape)}")
+    dense = value.coalesce().values() if value.is_sparse else value
+    if value.is_floating_point() and not bool(dense.isfinite().all()):
+        raise ValueError(f"{name} holds numbers that are not finite")
