@@ -116,23 +116,32 @@ def read_json(path: Path) -> dict[str, Any]:
     """The object that a JSON file holds.
 
     Raises:
-        UserError: no file, one of more than 64 MiB, no JSON, nested too deeply, or no object.
+        UserError: as `read_json_value`, or no object.
+    """
+    tree = read_json_value(path)
+    if not isinstance(tree, dict):
+        raise UserError(f"{path} holds a {type(tree).__name__}; expected an object")
+    return tree
+
+
+def read_json_value(path: Path) -> Any:
+    """What a JSON file holds, a list perhaps.
+
+    Raises:
+        UserError: no file, one of more than 64 MiB, no JSON, or nested too deeply.
     """
     if not path.is_file():
         raise UserError(f"there is no file {path}")
     if path.stat().st_size > _MOST_BYTES:
         raise UserError(f"{path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
     try:
-        tree = json.loads(path.read_bytes())
+        return json.loads(path.read_bytes())
     except RecursionError as error:
         raise UserError(f"{path} is nested too deeply") from error
     except ValueError as error:  # also of bytes that are no text, and of numbers without end
         raise UserError(f"{path} is no JSON: {error}") from error
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    if not isinstance(tree, dict):
-        raise UserError(f"{path} holds a {type(tree).__name__}; expected an object")
-    return tree
 
 
 def _finite(value: Any) -> float | None:

@@ -194,21 +194,25 @@ def _posed(
 
 def _read(photograph: Photograph) -> tuple[npt.NDArray[np.uint8], bool]:
     """RGBA (H, W, 4), and whether its alpha means anything."""
-    image = _decode(photograph.path, photograph.where)
+    image = decode(photograph.path, photograph.where)
     has_alpha = "A" in image.getbands() or "transparency" in image.info
     rgba = np.array(image.convert("RGBA"))
     demand_size(photograph.path, photograph.where, rgba.shape[:2], photograph.size)
     if photograph.mask is None:
         return rgba, has_alpha
     image_size(photograph.mask, f"{photograph.where}, mask")
-    mask = np.asarray(_decode(photograph.mask, f"{photograph.where}, mask").convert("L"))
+    mask = np.asarray(decode(photograph.mask, f"{photograph.where}, mask").convert("L"))
     demand_size(photograph.mask, f"{photograph.where}, mask", mask.shape[:2], photograph.size)
     rgba[..., 3] = np.minimum(rgba[..., 3], mask)
     return rgba, True
 
 
-def _decode(path: Path, where: str) -> Image.Image:
-    """A picture of 8 bits a channel, or a palette."""
+def decode(path: Path, where: str) -> Image.Image:
+    """A picture of 8 bits a channel, or a palette, as it stands in the file.
+
+    Raises:
+        UserError: no picture that can be read to its end, or one of floating-point numbers.
+    """
     try:
         with Image.open(path, formats=_FORMATS) as image:
             image.load()
