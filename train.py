@@ -2,6 +2,11 @@
 
 from typing import Any
 
+if __name__ == "__main__":  # first of all: what follows takes a second to load
+    from rendra_lab.signals import leave_at_once
+
+    leave_at_once()
+
 import hydra
 
 from rendra_lab.front_door import guarded

@@ -119,6 +119,7 @@ def run(cfg: DictConfig) -> float | None:
     keeps its last step, and ends the program with code 130 or 143; SIGUSR1 with 138, see `interruptions`.
     """
     with signals.listening():
+        signals.begun()
         return _run(cfg)
 
 

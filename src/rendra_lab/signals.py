@@ -5,6 +5,7 @@ Imported before anything else runs: stays light.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import os
 import signal
@@ -17,8 +18,9 @@ from typing import Any
 
 WATCHED = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name))
 
-_OURS_TO_TAKE = (signal.SIG_DFL, signal.default_int_handler)
 _SECOND_THOUGHT_S = 0.3  # terminals, srun and torchrun deliver one wish twice, at once
+_IMPORT_S = 30.0  # longer than a module takes to load
+_LOOK_AGAIN_S = 0.05
 
 
 class Interrupted(BaseException):
@@ -38,6 +40,32 @@ class Interrupted(BaseException):
         return 128 + self.number
 
 
+def leave_at_once() -> None:
+    """From here on a signal ends the program with one line and no more.
+
+    Until something is `listening`, and within imports until something has `begun` that would have to be put away.
+    """
+    _watch.in_a_hurry = True
+    for number in WATCHED:
+        if signal.getsignal(number) in _OURS_TO_TAKE:
+            signal.signal(number, _leave)
+
+
+def begun() -> None:
+    """From here on a program that a signal ends has something to put away."""
+    _watch.in_a_hurry = False
+
+
+def _leave(number: int, _: FrameType | None) -> None:
+    if os.environ.get("LOCAL_RANK", "0") == "0":
+        line = f"{os.path.basename(sys.argv[0])}: {Interrupted(number)}\n"
+        os.write(2, line.encode(errors="replace"))
+    os._exit(128 + number)
+
+
+_OURS_TO_TAKE = (signal.SIG_DFL, signal.default_int_handler, _leave)
+
+
 class _Watch:
     """The state of the one watch of a process."""
 
@@ -47,11 +75,16 @@ class _Watch:
         self.patience = 0
         self.caught: int | None = None
         self.caught_at = 0.0
+        self.postponed_at: float | None = None
+        self.comes_again = False
+        self.in_a_hurry = False
 
-    def handle(self, number: int, _: FrameType | None) -> None:
+    def handle(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self.owner:  # a forked worker, whose parent decides
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
+            return
+        if self.patience == 0 and self._postpones(number, frame):
             return
         first, now = self.caught is None, time.monotonic()
         insists = not first and number == signal.SIGINT and now - self.caught_at > _SECOND_THOUGHT_S
@@ -61,6 +94,34 @@ class _Watch:
             raise Interrupted(self.caught or number)
         if first and number == signal.SIGINT and os.environ.get("LOCAL_RANK", "0") == "0":
             sys.stderr.write("stopping after this step; Ctrl-C once more to stop at once\n")
+
+    def _postpones(self, number: int, frame: FrameType | None) -> bool:
+        """Whether a signal comes again later, as a module is being loaded.
+
+        Not every importer hands an exception on: torch, for one, goes on with half of NumPy.
+        """
+        now, loads = time.monotonic(), _loads_a_module(frame)
+        if loads and self.in_a_hurry:
+            _leave(number, frame)
+        since = now if self.postponed_at is None else self.postponed_at
+        self.postponed_at = since if loads and now - since < _IMPORT_S else None
+        if self.postponed_at is not None and not self.comes_again:
+            self.comes_again = True
+            _thread.start_new_thread(self._send_again, (number,))  # takes no lock, unlike threading's
+        return self.postponed_at is not None
+
+    def _send_again(self, number: int) -> None:
+        time.sleep(_LOOK_AGAIN_S)
+        self.comes_again = False
+        os.kill(os.getpid(), number)
+
+
+def _loads_a_module(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 _watch = _Watch()

@@ -23,6 +23,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
+from rendra_lab import signals
 from rendra_lab.errors import UserError
 from rendra_lab.html_report import leave_sweep_report
 from rendra_lab.ledger import JobState, Ledger
@@ -54,6 +55,7 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """An exception of a callback would be a mere warning to Hydra: here it ends the program."""
+        signals.begun()
         try:
             _settle(config)
         except (OSError, UserError, HydraException, OmegaConfBaseException) as error:

@@ -1,6 +1,7 @@
 """Signals, real ones: what they leave in each phase of a run, the exit code, and that the run goes on from there."""
 
 import csv
+import importlib
 import json
 import os
 import signal
@@ -185,6 +186,41 @@ def test_what_somebody_else_handles_stays_theirs() -> None:
     assert heard == [signal.SIGUSR1]
 
 
+def load_and_wait(module: str) -> None:
+    with signals.listening():
+        importlib.import_module(module)
+        time.sleep(5)
+
+
+def test_a_module_that_is_being_loaded_is_loaded_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An importer may take an interrupted module for a whole one."""
+    waits = "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.2)\nwhole = True\n"
+    (tmp_path / "module_of_a_test.py").write_text(waits)
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        with pytest.raises(signals.Interrupted):
+            load_and_wait("module_of_a_test")
+        assert sys.modules["module_of_a_test"].whole
+    finally:
+        sys.modules.pop("module_of_a_test", None)
+
+
+@pytest.mark.parametrize("number", signals.WATCHED)
+@pytest.mark.parametrize("listens", [False, True])
+def test_a_program_that_only_loads_leaves_at_once(number: int, listens: bool, tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text("import time\nprint('loads', flush=True)\ntime.sleep(60)\n")
+    inner = "with signals.listening():\n    import slow\n" if listens else "import slow\n"
+    (tmp_path / "program.py").write_text(f"from rendra_lab import signals\nsignals.leave_at_once()\n{inner}")
+    process = subprocess.Popen(
+        [sys.executable, "program.py"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "loads\n"
+    process.send_signal(number)
+    assert process.communicate(timeout=30)[1] == f"program.py: interrupted by {signal.Signals(number).name}\n"
+    assert process.returncode == 128 + number
+
+
 @pytest.fixture
 def scontrol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A program of that name which writes down how it was called."""
@@ -277,7 +313,7 @@ def test_processes_of_one_run_end_together(to_all: bool, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("delay_s", [0.7, 1.5, 2.5, 4.0])
+@pytest.mark.parametrize("delay_s", [0.3, 0.7, 1.1, 1.5, 2.0, 2.5, 3.2, 4.0, 5.0])
 def test_a_signal_while_a_program_starts_gives_one_line(delay_s: float, tmp_path: Path) -> None:
     process = start(tmp_path, "trainer.max_steps=1000000")
     time.sleep(delay_s)

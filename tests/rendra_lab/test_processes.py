@@ -160,7 +160,7 @@ def test_two_processes_fit_what_one_fits(tmp_path: Path, compose: Compose) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["nerf", "volume"])
 def test_scenes_are_fitted_by_two_processes(task: str, tmp_path: Path) -> None:
-    small = ["data.views=6", "data.size_px=32", "data.rays_per_step=256", "trainer.max_steps=24",
+    small = ["data.counts=[6,2,2]", "data.image_size=32", "data.rays_per_step=256", "trainer.max_steps=24",
              "trainer.val_check_interval=12", "callbacks.turntable=null", "callbacks.surface=null"]  # fmt: skip
     process = start(tmp_path, f"task={task}", *small, *TWO)
     assert process.wait(timeout=500) == 0, (tmp_path / "said").read_text()
