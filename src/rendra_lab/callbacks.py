@@ -304,7 +304,7 @@ class BatchReport(Callback):
 
 
 class StopWhenSettled(Callback):
-    """Ends a fit whose loss is low enough, or has not improved for a while.
+    """Ends a fit whose loss is low enough, or has not improved for a while. Processes judge the mean of their losses.
 
     Args:
         monitor: what Lightning logs, such as `train/loss`.
@@ -334,7 +334,7 @@ class StopWhenSettled(Callback):
         known = trainer.callback_metrics
         if self.monitor not in known:
             raise UserError(f"StopWhenSettled.monitor: there is no {self.monitor!r}; there are: {', '.join(known)}")
-        value = float(known[self.monitor])
+        value = float(trainer.strategy.reduce(known[self.monitor], reduce_op="mean"))
         improved = self._best - value > self.improvement * abs(value)
         self._waited = 0 if improved else self._waited + 1
         self._best = min(self._best, value)

@@ -2,7 +2,7 @@
 
 before.ckpt         weights and optimizer before the step, a checkpoint like any other
 batch.pt            what the step saw: tensors and plain values, read without unpickling code
-random_state.pt     of Python, NumPy, torch and the device, at the start of the step
+random_state.pt     of Python, NumPy, torch and all other generators, at the start of the step
 config.yaml         of the run, resolved
 README.txt          what was found, and the command that makes the step again
 """
@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import random
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from rendra_lab import report
 from rendra_lab.errors import UserError
+from rendra_lab.random_state import Streams, owned_generators
 from rendra_lab.records import TensorRecord
 from rendra_lab.targets import below, trusted_packages
 
@@ -35,37 +34,12 @@ class _NotPlainError(Exception):
     """A batch holds something that a file without code cannot."""
 
 
-def random_state(device: torch.device) -> dict[str, Any]:
-    """The state of all generators, as tensors and plain values."""
-    version, words, gauss = random.getstate()
-    numpy_state: Any = np.random.get_state()  # noqa: NPY002 - the generator that other code draws from
-    state: dict[str, Any] = {
-        "python": (version, torch.tensor(words), gauss),
-        "numpy": (torch.from_numpy(numpy_state[1].astype(np.int64)), *numpy_state[2:]),
-        "torch": torch.get_rng_state(),
-    }
-    if device.type == "cuda":
-        state["device"] = torch.cuda.get_rng_state(device)
-    return state
-
-
-def set_random_state(state: Mapping[str, Any], device: torch.device) -> None:
-    """Puts all generators back to a state of `random_state`."""
-    version, words, gauss = state["python"]
-    random.setstate((version, tuple(words.tolist()), gauss))
-    keys, *rest = state["numpy"]
-    np.random.set_state(("MT19937", keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
-    torch.set_rng_state(state["torch"])
-    if device.type == "cuda" and "device" in state:
-        torch.cuda.set_rng_state(state["device"], device)
-
-
 def write(
     folder: Path,
     step: int,
     found: Sequence[str],
     batch: Any,
-    random: Mapping[str, Any],
+    streams: Streams,
     config: str,
     max_bytes: int,
 ) -> None:
@@ -76,12 +50,12 @@ def write(
         step: its number.
         found: what was not finite.
         batch: what the step saw.
-        random: `random_state` at its start.
+        streams: random ones at its start.
         config: of the run, YAML.
         max_bytes: a larger batch is left out, as is one that is not made of tensors and plain values.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    torch.save(dict(random), folder / _RANDOM)
+    torch.save(streams.to_plain(), folder / _RANDOM)
     (folder / CONFIG).write_text(config, encoding="utf-8")
     try:
         plain = _plain(batch)
@@ -117,11 +91,11 @@ class SameStart(Callback):
     """
 
     def __init__(self, folder: Path) -> None:
-        self.state = torch.load(folder / _RANDOM, weights_only=True)
+        self.streams = Streams.from_plain(torch.load(folder / _RANDOM, weights_only=True))
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Sets the random state."""
-        set_random_state(self.state, pl_module.device)
+        self.streams.restore(owned_generators(trainer))
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int

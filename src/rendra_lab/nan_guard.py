@@ -22,6 +22,7 @@ from torch.optim import Optimizer
 from rendra_lab import nan_evidence, report
 from rendra_lab.base_task import BaseTask
 from rendra_lab.errors import UserError
+from rendra_lab.random_state import Streams, owned_generators
 from rendra_lab.settings import Amount, Count, Positive
 
 log = logging.getLogger(__name__)
@@ -75,13 +76,18 @@ class NanGuard(Callback):
         self.skipped = 0
         self._in_a_row = 0
         self._batch: Any = None
-        self._random: dict[str, Any] = {}
+        self._generators: dict[str, Any] = {}
+        self._streams = Streams.now()
         self._collecting = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Finds what the fit draws random numbers from."""
+        self._generators = owned_generators(trainer)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """Remembers what a step starts from; a reference to its batch, no copy."""
         self._batch = batch
-        self._random = nan_evidence.random_state(pl_module.device)
+        self._streams = Streams.now(self._generators)
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Judges losses and gradients; leaves the update out, or raises NotFiniteError."""
@@ -154,7 +160,7 @@ class NanGuard(Callback):
             trainer.save_checkpoint(place / nan_evidence.STATE)
         if trainer.global_rank == guilty:
             limit = int(1e6 * self.max_batch_mb)
-            nan_evidence.write(place, step, bad, self._batch, self._random, self.config, limit)
+            nan_evidence.write(place, step, bad, self._batch, self._streams, self.config, limit)
         return place
 
     @contextmanager

@@ -127,7 +127,7 @@ class RandomState(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Goes on from the state of the checkpoint: loaders are made by now, and the next draw is a step's."""
-        self._generators = _owned_generators(trainer)
+        self._generators = owned_generators(trainer)
         if self._resumes_with:
             states, self._resumes_with = self._resumes_with, None
             Streams.from_plain(states[trainer.global_rank % len(states)]).restore(self._generators)
@@ -179,10 +179,10 @@ class RandomState(Callback):
             loop["epoch_loop.state_dict"]["_batches_that_stepped"] -= 1
 
 
-def _owned_generators(trainer: Trainer) -> dict[str, Any]:
+def owned_generators(trainer: Trainer) -> dict[str, Any]:
     """The generators that the task, its modules and the data module hold as attributes, by name."""
     owners = {f"task.{name}": module for name, module in trainer.lightning_module.named_modules()}
-    owners["data"] = trainer.datamodule  # type: ignore[attr-defined]
+    owners["data"] = getattr(trainer, "datamodule", None)
     kinds = (torch.Generator, np.random.Generator)
     return {
         f"{owner}.{name}": value

@@ -146,9 +146,17 @@ def test_a_report_scores_no_batch_twice(tmp_path: Path) -> None:
     assert float(row["psnr"]) == pytest.approx(float(trainer.callback_metrics["test/psnr"]))
 
 
+class OneOfTwo:
+    """A strategy of two processes; the other one's values are larger by 2."""
+
+    def reduce(self, value: torch.Tensor, reduce_op: str) -> torch.Tensor:
+        assert reduce_op == "mean"
+        return value + 1
+
+
 def steps_until_settled(values: list[float], **settings: Any) -> int:
     stop = StopWhenSettled("train/loss", **settings)
-    trainer = SimpleNamespace(callback_metrics={}, should_stop=False)
+    trainer = SimpleNamespace(callback_metrics={}, should_stop=False, strategy=OneOfTwo())
     for step, value in enumerate(values):
         trainer.callback_metrics["train/loss"] = torch.tensor(value)
         stop.on_train_batch_end(trainer, None, None, None, step)  # type: ignore[arg-type]
@@ -161,6 +169,10 @@ def steps_until_settled(values: list[float], **settings: Any) -> int:
 def test_a_fit_settles_whatever_the_sign_of_its_loss(sign: float) -> None:
     """Two gains, then losses that only grow worse."""
     assert steps_until_settled([sign + x for x in (5.0, 4.0, 3.0, 3.005, 3.006, 3.007, 3.008)], patience=3) == 5
+
+
+def test_processes_stop_together() -> None:
+    assert steps_until_settled([2.0, 1.0, 0.4, 0.0], below=1.5) == 2
 
 
 def test_a_monitor_that_is_not_logged_is_named() -> None:

@@ -17,6 +17,7 @@ from rendra_lab.data.repeated import Repeated
 from rendra_lab.errors import UserError
 from rendra_lab.experiment import run
 from rendra_lab.nan_guard import NanGuard, NotFiniteError
+from rendra_lab.random_state import Streams
 from rendra_lab.replay import replay
 
 Compose = Callable[..., Any]
@@ -122,7 +123,7 @@ def test_large_numbers_are_no_alarm_and_large_batches_not_kept(tmp_path: Path) -
     assert not _seem_finite((), [torch.full((100,), 1e30)])  # its square is none: looked at again, one by one
     assert _seem_finite([torch.tensor(1.0)], [torch.zeros(0), torch.ones(3, dtype=torch.float64)])
     batch = ToyBatch(torch.zeros(1, 8, 8, 3), torch.zeros(1, 8, 8))
-    state = nan_evidence.random_state(torch.device("cpu"))
+    state = Streams.now()
     nan_evidence.write(tmp_path, 3, ["train/loss"], batch, state, "a: 1\n", max_bytes=100)
     assert nan_evidence.read_batch(tmp_path) is None
     assert "larger than 0.0001 MB" in (tmp_path / "README.txt").read_text()
@@ -135,17 +136,6 @@ def test_a_batch_that_names_a_foreign_class_is_refused(tmp_path: Path) -> None:
         torch.save({"record": name, "fields": {}}, tmp_path / "batch.pt")
         with pytest.raises(UserError, match=message):
             nan_evidence.read_batch(tmp_path)
-
-
-def test_random_states_come_back() -> None:
-    import random
-
-    import numpy as np
-
-    state = nan_evidence.random_state(torch.device("cpu"))
-    drawn = random.random(), np.random.rand(), float(torch.rand(()))  # noqa: NPY002
-    nan_evidence.set_random_state(state, torch.device("cpu"))
-    assert drawn == (random.random(), np.random.rand(), float(torch.rand(())))  # noqa: NPY002
 
 
 class Rivals(BaseTask):
