@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,11 +100,13 @@ class LSP(PicturePeople):
     def _person(self, file: Path, joints: Joints, number: int) -> GivenPerson:
         where = f"{file}, person {number}"
         joints = check_joints(joints, LSP_JOINTS, where)
-        names = (f"im{number:04d}", f"im{number:05d}")
+        names = (f"im{number:04d}.jpg", f"im{number:05d}.jpg")
         folders = (self.path / "images", self.path)
         picture = next((path for folder in folders if (path := find_picture(folder, names, where))), None)
         size = box_size(joints) if picture is None else upright_size(picture, where)
-        return GivenPerson(where, names[0] if picture is None else str(picture), picture, size, joints)
+        return GivenPerson(
+            where, names[0].removesuffix(".jpg") if picture is None else str(picture), picture, size, joints
+        )
 
 
 def read_estimates(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
@@ -165,7 +168,7 @@ def read_annotations(path: Path, flags: str = "auto") -> tuple[npt.NDArray[np.fl
     return answer, np.arange(1, len(answer) + 1)
 
 
-def _arrays(path: Path) -> Iterator[tuple[str, npt.NDArray[np.generic]]]:
+def _arrays(path: Path) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """The arrays that matter of an .npz, without pickles and of bounded size."""
     try:
         with zipfile.ZipFile(path) as archive:
@@ -232,7 +235,7 @@ def _inflated(path: Path) -> bytes:
     return b"".join(parts)
 
 
-def _numbers(path: Path, array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+def _numbers(path: Path, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
         raise UserError(f"{path} holds {getattr(array, 'dtype', type(array).__name__)}; expected real numbers")
     return array

@@ -1,7 +1,11 @@
-"""Pictures of people, upright: detectors follow the EXIF data that turn a photograph, and so must what draws on it."""
+"""Pictures of people, upright.
+
+Detectors follow the EXIF data that turn a photograph, and so must what is drawn on it.
+"""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +15,7 @@ from PIL import Image
 from rendra_lab.data.photographs import SUFFIXES, decode, image_size
 from rendra_lab.errors import UserError
 
+_ENDINGS = (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES))
 _ORIENTATION = 0x0112
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -51,14 +56,15 @@ def find_picture(folder: Path, names: tuple[str, ...], where: str) -> Path | Non
     Raises:
         UserError: a name that leads out of the folder.
     """
+    inside = os.path.abspath(folder)
     for name in names:
-        if "\0" in name or not (folder / name).resolve().is_relative_to(folder.resolve()):
+        if "\0" in name or os.path.commonpath([os.path.abspath(folder / name), inside]) != inside:
             raise UserError(
-                f"{where}: the picture {name!r} lies outside {folder}; data.images=FOLDER says where it is"
+                f"{where}: the picture {name!r} lies outside {folder}: data.images=FOLDER says where it is"
             )
-        for suffix in ("", *SUFFIXES, *(suffix.upper() for suffix in SUFFIXES)):
-            path = folder / f"{name}{suffix}"
-            if (suffix or path.suffix.lower() in SUFFIXES) and path.is_file():
+        endings = ("",) if Path(name).suffix.lower() in SUFFIXES else _ENDINGS
+        for path in (folder / f"{name}{ending}" for ending in endings):
+            if path.is_file():
                 return path
     return None
 
