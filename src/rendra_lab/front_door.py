@@ -19,6 +19,7 @@ from hydra.errors import HydraException, InstantiationException, MissingConfigEx
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from rendra_lab import run_names, signals  # noqa: F401 - run_names is asked by name, in conf/hydra
 from rendra_lab.errors import UserError
@@ -27,7 +28,7 @@ from rendra_lab.sweep import conclude_sweep
 
 _EXIT_MISTAKE = 2  # the command or the configuration cannot be
 _EXIT_FAILURE = 1  # the run failed
-_MISTAKES = (HydraException, OmegaConfBaseException, UserError)
+_MISTAKES = (HydraException, OmegaConfBaseException, UserError, YAMLError)
 _WORDED = (*_MISTAKES, ValueError, OSError)  # exceptions that say what is wrong to someone without the source
 
 
@@ -58,14 +59,13 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         if FailureKeeper.failure is not None:
             raise FailureKeeper.failure
     except signals.Interrupted as stop:  # before the run, or between the runs of a sweep
-        conclude_sweep()
-        if os.environ.get("LOCAL_RANK", "0") == "0":
-            sys.stderr.write(f"{Path(script).name}: {stop}\n")
-        sys.exit(stop.code)
+        _end_interrupted(script, stop)
     except BrokenPipeError:  # the reader of the output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_EXIT_FAILURE)
     except Exception as error:
+        if stop := signals.behind(error):
+            _end_interrupted(script, stop)
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
         clear = isinstance(error, _MISTAKES) and not isinstance(error, InstantiationException)
@@ -81,6 +81,13 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         raise
     if conclude_sweep() is False:
         sys.exit(_EXIT_FAILURE)
+
+
+def _end_interrupted(script: str, stop: signals.Interrupted) -> NoReturn:
+    conclude_sweep()
+    if os.environ.get("LOCAL_RANK", "0") == "0":
+        sys.stderr.write(f"{Path(script).name}: {stop}\n")
+    sys.exit(stop.code)
 
 
 class FailureKeeper(Callback):
@@ -270,8 +277,9 @@ def _plain(error: Exception) -> str:
         if words.startswith(f"{key}."):
             return words
         return f"{key}.{words}" if _begins_with_parameter(words, str(error)) else f"{key}: {words}"
-    key = getattr(error, "full_key", None)
-    if isinstance(error, OmegaConfBaseException) and key:
+    if isinstance(error, OmegaConfBaseException):
+        asked = [item.partition("=")[0] for item in sys.argv[1:] if "${" in item]
+        key = getattr(error, "full_key", None) or (asked[0] if asked else "configuration")
         return f"{key}: {str(error).splitlines()[0]}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if isinstance(error, HydraException) and lines else " ".join(lines) or type(error).__name__

@@ -72,11 +72,11 @@ class OrbitCamera:
 
     def __post_init__(self) -> None:
         if not 0 < self.fov < 180:
-            raise ValueError(f"camera.fov must lie between 0 and 180 degrees, got {self.fov!r}")
+            raise UserError(f"camera.fov must lie between 0 and 180 degrees, got {self.fov!r}")
         if self.dist is not None and not self.dist > 0:
-            raise ValueError(f"camera.dist must be positive, or null to fit the mesh; got {self.dist!r}")
+            raise UserError(f"camera.dist must be positive, or null to fit the mesh; got {self.dist!r}")
         if self.at is not None and len(self.at) != 3:
-            raise ValueError(f"camera.at must be three numbers, or null for the mesh's middle; got {self.at!r}")
+            raise UserError(f"camera.at must be three numbers, or null for the mesh's middle; got {self.at!r}")
 
     def cameras(self, mesh: Meshes) -> Cameras:
         """The camera, on the mesh's device, with near and far planes round the mesh."""
@@ -144,7 +144,7 @@ class Shading:
 
     def __post_init__(self) -> None:
         if self.shows not in _SHOWS:
-            raise ValueError(f"shader.shows must be one of {', '.join(_SHOWS)}, got {self.shows!r}")
+            raise UserError(f"shader.shows must be one of {', '.join(_SHOWS)}, got {self.shows!r}")
 
     def settings(self, image_size: tuple[int, int]) -> RasterizationSettings:
         """How to rasterise an image of (height, width) pixels."""
@@ -177,11 +177,9 @@ class Studio:
     def __post_init__(self) -> None:
         height, width = self.size
         if not all(isinstance(side, int) and 1 <= side <= 8192 for side in self.size):
-            raise ValueError(
-                f"size, width and height must be whole pixels from 1 to 8192, got {width!r} x {height!r}"
-            )
+            raise UserError(f"size, width and height must be whole pixels from 1 to 8192, got {width!r} x {height!r}")
         if not (isinstance(self.antialias, int) and 1 <= self.antialias <= 8):
-            raise ValueError(f"antialias must be a whole number from 1 to 8, got {self.antialias!r}")
+            raise UserError(f"antialias must be a whole number from 1 to 8, got {self.antialias!r}")
 
     @torch.no_grad()
     def render(self, mesh: Meshes) -> Tensor:
@@ -248,9 +246,9 @@ def kind_of_picture(gallery: bool, turntable: str | None, transparent: bool) -> 
         ValueError: they contradict each other.
     """
     if turntable not in (None, "gif", "mp4"):
-        raise ValueError(f"turntable must be null, gif or mp4, got {turntable!r}")
+        raise UserError(f"turntable must be null, gif or mp4, got {turntable!r}")
     if gallery + (turntable is not None) + transparent > 1:
-        raise ValueError("gallery=true, turntable=... and transparent=true exclude each other: choose one")
+        raise UserError("gallery=true, turntable=... and transparent=true exclude each other: choose one")
     return "gallery" if gallery else turntable or ("cutout" if transparent else "picture")
 
 
@@ -261,11 +259,12 @@ def draw(kind: str, studio: Studio, mesh: Meshes, output: Path, frames: int = 36
         One line that says what was drawn, and that nothing is seen where that is so.
 
     Raises:
-        ValueError: the ending of `output` does not fit.
-        UserError: an MP4 without the extra [view].
+        UserError: the ending of `output` does not fit, `fps` is no rate, or an MP4 without the extra [view].
     """
     what = f"{len(mesh.verts_packed()):,} vertices, {len(mesh.faces_packed()):,} faces"
     if kind in ("gif", "mp4"):
+        if not 0 < fps <= 1000:
+            raise UserError(f"fps must lie above 0, at most 1000, got {fps!r}")
         _demand_writable(kind, output)
         save_animation(output, list(turntable(studio, mesh, frames)), fps, hold_s=0)
         return f"turntable of {what}, {frames} frames"
@@ -290,7 +289,7 @@ def _out_of_place(mesh: Meshes) -> str:
 
 def _demand_writable(kind: str, output: Path) -> None:
     if output.suffix.lower() != f".{kind}":
-        raise ValueError(f"turntable={kind} writes a .{kind} file, but output is {output}")
+        raise UserError(f"turntable={kind} writes a .{kind} file, but output is {output}")
     if kind == "mp4" and find_spec("av") is None:
         raise UserError("an MP4 needs a video encoder: pip install 'rendra[view]'; or choose turntable=gif")
 
@@ -315,7 +314,7 @@ def turntable(studio: Studio, mesh: Meshes, frames: int) -> Iterator[Picture]:
         ValueError: fewer than two frames.
     """
     if not (isinstance(frames, int) and frames >= 2):
-        raise ValueError(f"a turntable needs at least 2 frames, got {frames!r}")
+        raise UserError(f"a turntable needs at least 2 frames, got {frames!r}")
     for frame in range(frames):
         camera = replace(studio.camera, azim=studio.camera.azim + 360 * frame / frames)
         yield to_picture(replace(studio, camera=camera).render(mesh)[..., :3])
@@ -330,9 +329,9 @@ def save_image(path: str | Path, image: Tensor, transparent: bool) -> Path:
     path = Path(path)
     known = Image.registered_extensions()
     if path.suffix.lower() not in known:
-        raise ValueError(f"output must end in .png, .jpg or another image format, got {path}")
+        raise UserError(f"output must end in .png, .jpg or another image format, got {path}")
     if transparent and known[path.suffix.lower()] not in ("PNG", "WEBP", "TIFF"):
-        raise ValueError(f"{path.suffix} files cannot be transparent; choose .png")
+        raise UserError(f"{path.suffix} files cannot be transparent; choose .png")
     pixels = (image if transparent else image[..., :3]).mul(255).round().to("cpu", torch.uint8).numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path)
@@ -343,14 +342,15 @@ def parse_color(color: str | Sequence[float]) -> tuple[float, float, float]:
     """RGB in [0, 1] from a name, `#rrggbb` or three numbers in [0, 1].
 
     Raises:
-        ValueError: it is none of these.
+        UserError: it is none of these.
     """
-    if isinstance(color, str):
-        red, green, blue = ImageColor.getrgb(color)[:3]
-        return red / 255, green / 255, blue / 255
-    values = [float(value) for value in color]
-    if len(values) != 3 or min(values) < 0 or max(values) > 1:
-        raise ValueError(f"background must be a colour name, #rrggbb or [r,g,b] in [0, 1], got {color!r}")
+    try:
+        values = [value / 255 for value in ImageColor.getrgb(color)[:3]] if isinstance(color, str) else list(color)
+        valid = len(values) == 3 and all(0 <= value <= 1 for value in values)
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise UserError(f"background must be a colour name, #rrggbb or [r,g,b] in [0, 1], got {color!r}")
     return values[0], values[1], values[2]
 
 
