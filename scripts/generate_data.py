@@ -1,4 +1,4 @@
-"""Write posed images as a folder of a common format: `python scripts/generate_data.py --help`."""
+"""Write posed images, or people, as a folder of a common format: `python scripts/generate_data.py --help`."""
 
 from typing import Any
 
@@ -17,9 +17,13 @@ def main(cfg: Any) -> None:
     from rendra_lab.targets import check_targets
 
     check_targets(OmegaConf.to_container(cfg, resolve=True))
+    data = instantiate(cfg.data, _convert_="all")
+    if hasattr(data, "write"):  # it knows how: people have a layout of their own
+        print(data.write(cfg.output, cfg.overwrite))
+        return
     target = (cfg.output, cfg.format, cfg.overwrite)
     check_output(*target)
-    scene = instantiate(cfg.data, _convert_="all").load()
+    scene = data.load()
     folder = write_scene(scene, *target)
     print(f"{len(scene.train)} training, {len(scene.val)} validation and {len(scene.test)} test views\n{folder}")
 

@@ -1,16 +1,16 @@
 """How far the 24 joints of SMPL's skeleton turn.
 
-A rotation is parted into a twist about the bone and a swing of the bone, R = swing twist: a raised arm that also turns
-about itself has the same three angles whichever of them came first in the animator's mind, which Euler angles and the
-components of a rotation vector do not give. Bones lie along y (legs, trunk, head) or x (arms) at rest.
+A rotation is parted into a twist about the bone and a swing of the bone, R = swing twist: where an arm points is then
+bounded apart from how it turns about itself, which Euler angles and the components of a rotation vector mix. Bones
+lie along y (legs, trunk, head) or x (arms) at rest.
 Axes at rest: y up, the body looks along +z, its left arm along +x. Turns of a right joint mirror those of the left
 one: (x, y, z) becomes (x, -y, -z).
 
-Ranges: American Academy of Orthopaedic Surgeons, "Joint Motion: Method of Measuring and Recording", 1965, and Boone and
-Azen, "Normal range of motion of joints in male subjects", J. Bone Joint Surg. 61-A, 1979. Widened where athletes reach
-further (hips), and divided where several of SMPL's joints share what is measured as one: the 80 degrees of the back
-between three, those of the neck between two, the 180 of a raised arm between collar and shoulder, the 80 and 80 of
-the forearm's turn between elbow and wrist.
+Ranges: American Academy of Orthopaedic Surgeons, "Joint Motion: Method of Measuring and Recording", 1965, and Boone
+and Azen, "Normal range of motion of joints in male subjects", J. Bone Joint Surg. 61-A, 1979. Widened where athletes
+reach further (hips), and divided where several of SMPL's joints share what is measured as one: the 80 degrees of the
+back between three, those of the neck between two, the 180 of a raised arm between collar and shoulder, the 80 and 80
+of the forearm's turn between elbow and wrist.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 A key names what differs from standing at ease; a pair is (left, right), one number both sides alike.
 
-Trunk: flex forwards, side to the left, turn to the left; nod, tilt, look of the head likewise; pitch forwards and roll
-to the left of the pelvis in the world. Legs: hip flexion, abd(uction), out(ward turn), knee flexion, ankle (plantar
-flexion), toe (up). Arms: raise from hanging (0) over horizontal (90) to overhead (180), in the plane to the side (0) or
-in front (90); spin outwards of the upper arm, elbow flexion, palm (pronation), wrist flexion, shrug of the shoulder,
-grip of the fingers. The ranges are in `joint_limits`.
+Trunk: flex forwards, side to the left, turn to the left; nod, tilt, look of the head likewise; pitch forwards and
+roll to the left of the pelvis in the world. Legs: hip flexion, abd(uction), out(ward turn), knee flexion, ankle
+(plantar flexion), toe (up). Arms: raise from hanging (0) over horizontal (90) to overhead (180), in the plane to the
+side (0) or in front (90); spin outwards of the upper arm, elbow flexion, palm (pronation), wrist flexion, shrug of
+the shoulder, grip of the fingers. The ranges are in `joint_limits`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Family:
     free_arms: float = 0.0
 
 
-# The body leans into a step, and the arm swings with the leg of the other side; a stride is two keys and their mirror.
+# A stride is two keys and their mirror; an arm swings with the leg of the other side.
 FAMILIES: dict[str, Family] = {
     "standing": Family(10, (
         key(), key(hip=(4, -2), abd=(8, 2), knee=(8, 2), side=3), key(abd=14, out=14), key(flex=10, nod=18),
@@ -168,7 +168,8 @@ FAMILIES: dict[str, Family] = {
         key(raise_=(160, 14), plane=(60, 20), elbow=(10, 20), nod=-22, side=-10, ankle=20, shrug=(8, 0)),
         key(raise_=88, plane=82, elbow=14, flex=14, pitch=10, nod=-6),
         key(raise_=(100, 50), plane=(10, 30), elbow=(8, 40), side=18, hip=(25, 5), knee=(30, 6), abd=(20, 10)),
-        key(raise_=(70, 90), plane=(60, 70), elbow=(20, 14), hip=(70, -25), knee=(50, 12), pitch=42, flex=12, nod=-25),
+        key(raise_=(70, 90), plane=(60, 70), elbow=(20, 14), hip=(70, -25), knee=(50, 12), pitch=42, flex=12,
+            nod=-25),
     )),
     "overhead": Family(5, (
         key(raise_=170, plane=60, elbow=8, spin=35), key(raise_=140, plane=25, elbow=25, spin=40, flex=-6, nod=-15),
@@ -193,8 +194,8 @@ FAMILIES: dict[str, Family] = {
     "crawling": Family(3, (
         key(pitch=84, flex=6, hip=(92, 78), knee=(95, 88), ankle=40, raise_=(82, 96), plane=85, elbow=10, nod=-26),
         key(pitch=84, flex=2, hip=(78, 92), knee=(88, 95), ankle=40, raise_=(96, 82), plane=85, elbow=10, nod=-26),
-        key(pitch=80, flex=10, hip=(108, 18), knee=(105, 22), ankle=(10, 0), toe=(30, 50), raise_=82, plane=80, elbow=6,
-            nod=-24),
+        key(pitch=80, flex=10, hip=(108, 18), knee=(105, 22), ankle=(10, 0), toe=(30, 50), raise_=82, plane=80,
+            elbow=6, nod=-24),
         key(pitch=82, flex=0, hip=4, knee=4, ankle=0, toe=55, raise_=84, plane=72, elbow=12, spin=20, nod=-16),
         key(pitch=82, flex=0, hip=6, knee=5, toe=55, raise_=58, plane=40, elbow=95, spin=25, nod=-20),
     ), is_cyclic=True),
@@ -223,9 +224,11 @@ FAMILIES: dict[str, Family] = {
 ARMS: tuple[Key, ...] = (
     key(), key(elbow=25, plane=50), key(raise_=46, plane=-12, elbow=98, spin=-80, palm=40, wrist=20),
     key(raise_=40, plane=70, elbow=110, spin=-46), key(raise_=168, plane=55, elbow=10, spin=35),
-    key(raise_=130, plane=25, elbow=125, spin=78), key(raise_=92, plane=8, elbow=6), key(raise_=88, plane=82, elbow=10),
+    key(raise_=130, plane=25, elbow=125, spin=78), key(raise_=92, plane=8, elbow=6),
+    key(raise_=88, plane=82, elbow=10),
     key(raise_=36, plane=72, elbow=112, spin=8), key(raise_=28, plane=80, elbow=88, spin=-6),
     key(raise_=62, plane=50, elbow=125, spin=20), key(raise_=110, plane=60, elbow=70, spin=60),
-    key(raise_=30, plane=-70, elbow=20), key(raise_=75, plane=10, elbow=60, spin=-60), key(raise_=95, plane=40, elbow=30),
+    key(raise_=30, plane=-70, elbow=20), key(raise_=75, plane=10, elbow=60, spin=-60),
+    key(raise_=95, plane=40, elbow=30),
 )  # fmt: skip
 """What arms do of their own, left and right alike; each side may draw another one."""

@@ -94,11 +94,11 @@ def draw_poses(count: int, seed: int = 0, random_share: float = 0.06, noise: flo
 
 def _of_families(family: Tensor, noise: float, generator: torch.Generator) -> NaturalPoses:
     """One pose for each number of a family."""
-    joints = torch.zeros(len(family), len(SMPL_JOINTS), 3)
-    trunk = torch.eye(3).repeat(len(family), 1, 1)
+    angles = _neutral(len(family))
     for number, kind in enumerate(FAMILIES.values()):
         rows = (family == number).nonzero()[:, 0]
-        joints[rows], trunk[rows] = _as_pose(_between_keys(kind, len(rows), noise, generator))
+        angles[rows] = _between_keys(kind, len(rows), noise, generator)
+    joints, trunk = _as_pose(angles)
     rows = (family == len(FAMILIES)).nonzero()[:, 0]
     joints[rows] = _anything(len(rows), generator)
     upright = math.radians(20) * torch.randn(len(rows), 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0])
@@ -160,7 +160,7 @@ def _anything(count: int, generator: torch.Generator) -> Tensor:
 
 
 def _as_pose(angles: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation vectors (N, 24, 3) within the limits, and turns of the trunk (N, 3, 3), of angles (N, A) in degrees."""
+    """Rotation vectors (N, 24, 3) within the limits and turns of the trunk (N, 3, 3) of angles (N, A) in degrees."""
     angles = angles * (math.pi / 180)
     named = dict(zip(ANGLES, angles.unbind(1), strict=True))
     zero = torch.zeros_like(angles[:, 0])
@@ -212,7 +212,7 @@ def _arm(limb: dict[str, Tensor], sign: float) -> dict[str, Tensor]:
 
 
 def _turn(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) of a swing about two axes after a twist about y: legs and trunks; arms have one at a time."""
+    """Rotations (N, 3, 3): a twist about y, then a swing about x and z."""
     zero = torch.zeros_like(x)
     swing = axis_angle_to_matrix(torch.stack([x, zero, z], dim=1))
     return swing @ axis_angle_to_matrix(torch.stack([zero, y, zero], dim=1))
@@ -251,7 +251,9 @@ def limbs_apart(pose: Tensor) -> Tensor:
 _Sphere = tuple[str, tuple[float, float, float], float]
 _TRUNK_SPHERES: list[_Sphere] = [
     (bone, (x, up, forth), 0.105)
-    for bone, up, forth in (("pelvis", 0.0, 0.02), ("spine1", 0.05, 0.055), ("spine2", 0.06, 0.045), ("spine3", 0.07, 0.03))
+    for bone, up, forth in (
+        ("pelvis", 0.0, 0.02), ("spine1", 0.05, 0.055), ("spine2", 0.06, 0.045), ("spine3", 0.07, 0.03)
+    )
     for x in (-0.055, 0.055)
 ]  # fmt: skip
 
@@ -295,7 +297,7 @@ def _spheres(joints: Tensor, rotations: Tensor, rows: list[_Sphere]) -> tuple[Te
 
 def _neutral(count: int) -> Tensor:
     """Angles (count, A) in degrees of standing at ease."""
-    return _table((FAMILIES["standing"].keys[0],) * count)
+    return _table(FAMILIES["standing"].keys[:1]).repeat(count, 1)
 
 
 def _table(keys: tuple[Key, ...]) -> Tensor:
