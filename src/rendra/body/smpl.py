@@ -102,7 +102,7 @@ class SMPL(nn.Module):
 
     def __init__(self, parts: BodyParts) -> None:
         super().__init__()
-        _check(parts)
+        check_parts(parts)
         self.parents = check_parents(parts.parents)
         self.joint_names = parts.joint_names or _names(len(self.parents))
         self.head_top = int(parts.v_template[:, 1].argmax()) if parts.head_top is None else parts.head_top
@@ -263,7 +263,12 @@ def _names(count: int) -> tuple[str, ...]:
     return SMPL_JOINTS if count == len(SMPL_JOINTS) else tuple(f"joint_{index}" for index in range(count))
 
 
-def _check(parts: BodyParts) -> None:
+def check_parts(parts: BodyParts) -> None:
+    """Whether parts fit each other.
+
+    Raises:
+        ValueError: which does not, and what was expected; or numbers that are not finite.
+    """
     verts, joints = len(parts.v_template), len(parts.parents)
     if not verts or not joints:
         raise ValueError(f"a body has vertices and joints, got {verts} and {joints}")

@@ -4,7 +4,7 @@ Letters: B bodies, V vertices, J joints, K joints at most that hold one vertex.
 Loper et al., "SMPL: A Skinned Multi-Person Linear Model", 2015, Eq. 2 and 3.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -91,11 +91,14 @@ def _words(tensor: Tensor) -> str:
     return f"{tuple(tensor.shape)} of {tensor.dtype}"
 
 
+def _arrays(*tensors: Tensor) -> Any:
+    return tuple(tensor.contiguous().numpy() for tensor in tensors)
+
+
 @torch.library.custom_op("rendra::skin", mutates_args=(), device_types="cpu")
 def _skin_on_cpu(verts: Tensor, moves: Tensor, joints: Tensor, weights: Tensor) -> Tensor:
     skinned = torch.empty_like(verts, memory_format=torch.contiguous_format)
-    arrays = (tensor.contiguous().numpy() for tensor in (verts, moves, joints, weights))
-    numba_cpu.forward(*arrays, skinned.numpy())
+    numba_cpu.forward(*_arrays(verts, moves, joints, weights, skinned))
     return skinned
 
 
@@ -109,8 +112,7 @@ def _gradient_on_cpu(
     verts: Tensor, moves: Tensor, joints: Tensor, weights: Tensor, upstream: Tensor
 ) -> tuple[Tensor, Tensor]:
     grads = _empty_gradients(verts, moves)
-    arrays = (tensor.contiguous().numpy() for tensor in (verts, moves, joints, weights, upstream))
-    numba_cpu.backward(*arrays, (grads[0].numpy(), grads[1].numpy()))
+    numba_cpu.backward(*_arrays(verts, moves, joints, weights, upstream, *grads))
     return grads
 
 

@@ -22,10 +22,9 @@ def forward(
 
 def backward(
     verts: np.ndarray, moves: np.ndarray, joints: np.ndarray, weights: np.ndarray, upstream: np.ndarray,
-    grads: tuple[np.ndarray, np.ndarray],
+    grad_verts: np.ndarray, grad_moves: np.ndarray,
 ) -> None:  # fmt: skip
     """Write the gradients of the vertices (B, V, 3) and of the transforms (B, J, 12)."""
-    grad_verts, grad_moves = grads
     blocks = (verts.shape[1] + _BLOCK - 1) // _BLOCK
     parts = np.empty((len(verts), blocks, *moves.shape[1:]), np.float32)
     _differentiate(verts, moves, joints, weights, upstream, num_threads(), grad_verts, parts)
