@@ -157,7 +157,7 @@ def _demand_inside(person: GivenPerson) -> None:
     bad = np.flatnonzero(outside & (confidence > 0))
     if len(bad):
         raise UserError(
-            f"{person.where}, {LSP_JOINTS[bad[0]]}: it is at ({x[bad[0]]:g}, {y[bad[0]]:g}), far outside its picture; "
-            f"expected x from {-width} to {2 * width} and y from {-height} to {2 * height}, "
+            f"{person.where}, {LSP_JOINTS[bad[0]]}: it is at ({x[bad[0]]:g}, {y[bad[0]]:g}), far outside its "
+            f"picture; expected x from {-width} to {2 * width} and y from {-height} to {2 * height}, "
             f"for {width} x {height} pixels"
         )
