@@ -64,8 +64,8 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_EXIT_FAILURE)
     except Exception as error:
-        if stop := signals.behind(error):
-            _end_interrupted(script, stop)
+        if wish := signals.behind(error):
+            _end_interrupted(script, wish)
         if conclude_sweep() is not None and not verbose:
             sys.exit(_EXIT_FAILURE)  # the table has said it
         clear = isinstance(error, _MISTAKES) and not isinstance(error, InstantiationException)

@@ -125,12 +125,12 @@ def _wanted(trainer: Trainer) -> int | None:
 
 def signal_of(error: BaseException) -> int | None:
     """The number of the signal that ended a run; None where it ended by something else."""
-    if isinstance(error, Interrupted):
-        return error.number
     if isinstance(error, SIGTERMException):
         return int(signal.SIGTERM)
     if isinstance(error, SaveError):  # whatever came before: what the run reached is not kept
         return None
+    if stop := signals.behind(error):
+        return stop.number
     stopped = isinstance(error, KeyboardInterrupt) or isinstance(error.__context__, KeyboardInterrupt)
     return int(signal.SIGINT) if stopped else None
 

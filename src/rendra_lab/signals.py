@@ -66,6 +66,17 @@ def _leave(number: int, _: FrameType | None) -> None:
 _OURS_TO_TAKE = (signal.SIG_DFL, signal.default_int_handler, _leave)
 
 
+def behind(error: BaseException | None) -> Interrupted | None:
+    """The interruption that an exception is or came out of: tidying up, half done, fails easily. None for others."""
+    seen = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, Interrupted):
+            return error
+        seen.add(id(error))
+        error = error.__context__
+    return None
+
+
 class _Watch:
     """The state of the one watch of a process."""
 

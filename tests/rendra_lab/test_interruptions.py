@@ -186,6 +186,20 @@ def test_what_somebody_else_handles_stays_theirs() -> None:
     assert heard == [signal.SIGUSR1]
 
 
+def stop_untidily() -> None:
+    try:
+        raise signals.Interrupted(signal.SIGTERM)
+    finally:
+        [].pop()
+
+
+def test_what_fails_over_an_interruption_is_one() -> None:
+    with pytest.raises(IndexError) as caught:
+        stop_untidily()
+    assert interruptions.signal_of(caught.value) == signal.SIGTERM
+    assert interruptions.signal_of(IndexError()) is None
+
+
 def load_and_wait(module: str) -> None:
     with signals.listening():
         importlib.import_module(module)
