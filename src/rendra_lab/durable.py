@@ -65,7 +65,7 @@ class Sink:
         self._pending = bytearray()
 
 
-def write_durably(path: Path, fill: Callable[[Sink], object], verify: Callable[[Path], object]) -> None:
+def write_durably(path: Path, fill: Callable[[Sink], object], verify: Callable[[Path], object] | None = None) -> None:
     """Replaces a file by a new one that has been proven, and is on the disk; until then the old one stays.
 
     The new content goes to a hidden file in the same folder (a rename between filesystems is a copy, which can be
@@ -74,26 +74,42 @@ def write_durably(path: Path, fill: Callable[[Sink], object], verify: Callable[[
     Args:
         path: of the file; its folder is made where it is missing.
         fill: writes the content.
-        verify: is given the path of the new file before it takes the name; raises where that is not whole.
+        verify: is given the path of the new file before it takes the name; raises where that is not whole. None for
+            content without a checksum.
 
     Raises whatever failed; then no partial file is left, and what stood at `path` still does. The one exception is a
     failure after the name was taken, to force the folder to the disk: then the new file stands there, whole.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with draft_of(path) as partial:
         with _held(partial) as descriptor:
             sink = Sink(descriptor)
             fill(sink)
             sink.finish()
             _patiently(os.fsync, descriptor)
-        verify(partial)
+        if verify is not None:
+            verify(partial)
+    _force_folder(path.parent)
+
+
+@contextlib.contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """The path of a hidden file in the same folder, to be written within the block; then it takes the name.
+
+    For what can be made again. Nothing is forced to the disk: after the machine itself has failed, the file may be
+    empty. Where the block fails, no draft is left, and what stood at `path` still does.
+
+    Args:
+        path: of the file; its folder is made where it is missing.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield partial
         _patiently(os.replace, partial, path)
     except BaseException:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
-    _force_folder(path.parent)
 
 
 def sweep_leftovers(folder: Path) -> list[Path]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import platform
 import subprocess
 import sys
@@ -13,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from rendra_lab.durable import write_durably
 
 _PACKAGES = ("rendra", "torch", "lightning", "numpy", "numba", "hydra-core", "torchmetrics", "tensorboard")
 
@@ -27,16 +28,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def write_text(path: Path, content: str) -> None:
     """Writes a text file atomically, into a folder that is made where it is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_durably(path, lambda sink: sink.write(content.encode()))
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +10,8 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+
+from rendra_lab.durable import draft_of
 
 log = logging.getLogger(__name__)
 
@@ -53,15 +53,9 @@ def _read(path: Path, what: str) -> Tensors | None:
 
 def _write(path: Path, what: str, tensors: Tensors) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-        os.close(handle)
-        try:
-            whole = {key: tensor.contiguous() for key, tensor in tensors.items()}
-            save_file(whole, name, {"crc32": _checksum(whole)})
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
+        whole = {key: tensor.contiguous() for key, tensor in tensors.items()}
+        with draft_of(path) as draft:
+            save_file(whole, draft, {"crc32": _checksum(whole)})
     except OSError as error:
         log.warning("%s cannot be cached in %s: %s", what, path.parent, error)
 
