@@ -30,14 +30,20 @@ CONF = Path(__file__).parents[2] / "conf"
 STEPS = 8
 SEED = random.SystemRandom().randrange(10**6)  # stands in the message of whatever fails
 
-_VIEWS = ("data.image_size=16", "data.counts=[4,1,1]", "data.antialias=1", "data.rays_per_step=48")
+_VIEWS = ("mesh=ico_sphere", "data.image_size=16", "data.counts=[4,1,1]", "data.antialias=1", "data.rays_per_step=48")
 _SCENE = (*_VIEWS, "data.rays_per_pixel_side=[[0,1],[6,2]]", "data.jitter=true", "trainer.val_check_interval=5")
 _OCCUPANCY = ("sampler.cells=8", "sampler.steps_across=8", "sampler.refresh_every=3", "sampler.empty_from=4")
 _HASHES = ("field.encoding.log2_table_size=8", "field.width=8")
 _VOLUME = ("volume.voxels=[6,8]", "module.refine_at=[4]", "+module.look_every=3", "+module.look_from=3")
 _SMALL_MESH = ("mesh=torus", "scene.image_size=24")
 SMALLER = {
-    "mesh_fit": ("surface.levels=[1,2,3]", "module.refine_at=[2,5]", "module.samples=200"),
+    "mesh_fit": (
+        "data.name=ico_sphere",
+        "data.scan_points=500",
+        "surface.levels=[1,2,3]",
+        "module.refine_at=[2,5]",
+        "module.samples=200",
+    ),
     "nerf": (*_SCENE, *_OCCUPANCY, *_HASHES),
     "volume": (*_SCENE, *_VOLUME),
     "pose_track": ("data.frames=4", "data.steps_per_frame=3", *_SMALL_MESH),
