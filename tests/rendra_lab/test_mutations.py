@@ -14,8 +14,10 @@ from rendra_lab.errors import UserError
 from rendra_lab.settings import check_run, hints_of
 from rendra_lab.targets import check_targets
 
-TASKS = ("localize", "mesh_fit", "pose", "pose_track", "nerf", "volume")
-EXPERIMENTS = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "experiment").glob("*.yaml"))
+CONF = Path(__file__).parents[2] / "conf"
+CHOICES = [
+    f"{group}={path.stem}" for group in ("task", "experiment") for path in sorted((CONF / group).glob("*.yaml"))
+]
 
 # What is wrong, and what the line says of it. The command is train.py unless its first word ends in .py.
 FAST = {
@@ -103,7 +105,7 @@ SLOW = {
     "task=nerf data=colmap data.path=a_file": "a_file",
     "task=nerf data=llff data.path=folder": "folder",
     "task=nerf data=transforms data.path=5": "data.path must be text",
-    "task=nerf sampler=stratified sampler.samples=-1": "sampler.samples must be at least 1, got -1",
+    "task=nerf sampler=stratified sampler.samples=-1": "sampler.samples must be at least 2, got -1",
     "task=nerf sampler=stratified field=mlp_original field.skip=99": "field.skip must be null or the index of",
     f"task=volume {_SMALL} volume.voxels=[0]": "volume.voxels are numbers of voxels, at least 2",
     f"task=volume {_SMALL} volume.steps_per_voxel=0": "volume.steps_per_voxel must be above 0, got 0",
@@ -119,7 +121,7 @@ SLOW = {
     "task=pose mesh.path=/nowhere.obj": "there is no mesh file /nowhere.obj",
     "task=pose data=photo_view": "data.image needs a value: data.image=...",
     "task=pose data=photo_view data.image=/nowhere.png": "/nowhere.png",
-    "task=pose init.position=[1,2]": "init",
+    "task=pose init.position=[1,2]": "a start position has three coordinates",
     "task=pose solver=levenberg_marquardt optimizer.difference=[0,1]": "optimizer: difference goes from a wide",
     "task=pose scene.fov_deg=190": "fov_deg must lie between 0 and 180 degrees, got 190",
     "task=pose loss.silhouette.prediction=nothing": "LossTerm 'silhouette': the prediction",
@@ -197,9 +199,7 @@ _TAKES_WORDS = {"devices", "val_check_interval"}
 _PASSES_ON = {"rendra_lab.data.meshes.load_mesh"}
 
 
-@pytest.mark.parametrize(
-    "choice", [*(f"task={name}" for name in TASKS), *(f"experiment={name}" for name in EXPERIMENTS)]
-)
+@pytest.mark.parametrize("choice", CHOICES)
 def test_every_knob_refuses_what_is_no_number(choice: str, compose: Callable[..., Any], tmp_path: Path) -> None:
     tree = OmegaConf.to_container(compose(tmp_path / "task" / "run", choice), resolve=True)
     assert isinstance(tree, dict)
