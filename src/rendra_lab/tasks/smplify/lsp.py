@@ -100,13 +100,11 @@ class LSP(PicturePeople):
     def _person(self, file: Path, joints: Joints, number: int) -> GivenPerson:
         where = f"{file}, person {number}"
         joints = check_joints(joints, LSP_JOINTS, where)
-        names = (f"im{number:04d}.jpg", f"im{number:05d}.jpg")
+        names = (f"im{number:04d}", f"im{number:05d}")
         folders = (self.path / "images", self.path)
         picture = next((path for folder in folders if (path := find_picture(folder, names, where))), None)
         size = box_size(joints) if picture is None else upright_size(picture, where)
-        return GivenPerson(
-            where, names[0].removesuffix(".jpg") if picture is None else str(picture), picture, size, joints
-        )
+        return GivenPerson(where, names[0] if picture is None else str(picture), picture, size, joints)
 
 
 def read_estimates(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:

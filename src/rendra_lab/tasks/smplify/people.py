@@ -19,8 +19,8 @@ from torch import Tensor
 from rendra.body import SMPL
 from rendra_lab.data.kept_tensors import kept_or_made
 from rendra_lab.errors import UserError
-from rendra_lab.number_checks import check_at_least, check_shares
 from rendra_lab.synthesis.people import Crowd, Painter, draw_crowd
+from rendra_lab.settings import Fraction, Positive, check_numbers
 from rendra_lab.tasks.smplify.markers import MarkerSet
 from rendra_lab.tasks.smplify.people_data import PeopleData, Picture
 from rendra_lab.tasks.smplify.records import LSP_JOINTS, BodyTruth, PeopleBatch
@@ -66,8 +66,8 @@ class GeneratedPeople(PeopleData):
         steps: int = 10_000,
     ) -> None:
         super().__init__(steps)
-        check_at_least(1, "data", count=count)
-        check_shares("data", missing=missing, swapped=swapped)
+        check_numbers("data", Positive, count=count)
+        check_numbers("data", Fraction, missing=missing, swapped=swapped)
         if not 0 <= noise_px < 1e6:
             raise UserError(f"data.noise_px must be at least 0, got {noise_px}")
         size = [image_size] * 2 if isinstance(image_size, int) else list(image_size)

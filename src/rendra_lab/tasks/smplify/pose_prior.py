@@ -132,6 +132,16 @@ class PosePrior(nn.Module):
         return apart, (apart.detach().square().sum(-1) + self.constants.to(pose.dtype)).argmin(1)
 
 
+def generated_prior() -> PosePrior:
+    """What `prior=generated` is: `PosePrior.built_in`."""
+    return PosePrior.built_in()
+
+
+def prior_file(path: str | Path) -> PosePrior:
+    """What `prior=file prior.path=FILE` is: `PosePrior.load`."""
+    return PosePrior.load(path)
+
+
 def _check(means: Tensor, covariances: Tensor, weights: Tensor) -> None:
     if means.ndim != 2 or 0 in means.shape:
         raise ValueError(f"means must be (G, D), got {tuple(means.shape)}")
