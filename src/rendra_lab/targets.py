@@ -33,7 +33,6 @@ _ALLOWED_FUNCTIONS = (
     "rendra.transforms",
     "rendra.utils",
     "rendra_lab.data.bodies",
-    "rendra_lab.data.bodies",
     "rendra_lab.data.meshes",
     "rendra_lab.losses",
     "rendra_lab.mesh_quality",
@@ -41,6 +40,7 @@ _ALLOWED_FUNCTIONS = (
     "rendra_lab.perceptual",
     "rendra_lab.schedulers",
     "rendra_lab.tasks.smplify.pose_prior",
+    "rendra_lab.tasks.smplify.scores",
     "torch.nn.functional",
     "torchmetrics.functional",
 )

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import jvp, vmap
 from torchmetrics import Metric
 
 from rendra_lab.records import read_field
@@ -114,6 +115,25 @@ class LossTerm(_Term):
         if weight < 0:
             raise ValueError(f"a sum of squares needs a weight of at least 0, got {weight}")
         return weight**0.5 * self.fn.residuals(*positional, **keyword)
+
+    def row_derivatives(self, prediction: Any, batch: Any, changes: Tensor, step: int = 0) -> Tensor:
+        """How `residual_rows` (N, R) change as the predicted field (N, ...) does: (N, R, P).
+
+        Args:
+            prediction, batch, step: as there.
+            changes: (N, ..., P) of the field, in P directions.
+        """
+        positional, keyword = self._arguments(prediction, batch)
+        field, *others = positional
+        if hasattr(self.fn, "row_derivatives"):
+            rows = self.fn.row_derivatives(changes, field, *others, **keyword)
+        else:
+
+            def along(change: Tensor) -> Tensor:
+                return jvp(lambda value: self.fn.residuals(value, *others, **keyword), (field,), (change,))[1]
+
+            rows = vmap(along, in_dims=-1, out_dims=-1)(changes)
+        return self.weight_at(step) ** 0.5 * rows
 
 
 class MetricTerm(_Term):

@@ -8,18 +8,20 @@ are pixels of one in which the person is as large as in the paper's (`PeopleBatc
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from rendra.body import SMPL_JOINTS
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
+from rendra_lab.tasks.smplify.records import COUNTED
 
 
 class SumOfSquares(nn.Module):
     """A term: `residuals` are its rows, one a fit, and the term is their squared length."""
 
-    def forward(self, *arguments: Tensor, **named: Tensor) -> Tensor:
+    def forward(self, *arguments: Any, **named: Tensor) -> Tensor:
         """The sum of the squares of all fits."""
         return self.residuals(*arguments, **named).square().sum()
 
@@ -33,7 +35,7 @@ class Reprojection(SumOfSquares):
 
     Args:
         scale_px: s.
-        joint_weights: of each joint of the picture; the hips of two skeletons differ by convention, the neck too.
+        joint_weights: of each joint of the picture; None: 1 for those that count (`COUNTED`), 0 for the others.
     """
 
     weights: Tensor
@@ -43,8 +45,7 @@ class Reprojection(SumOfSquares):
         if not scale_px > 0:
             raise ValueError(f"scale_px must be positive, got {scale_px}")
         self.scale_px = scale_px
-        usual = [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 1.0]
-        self.register_buffer("weights", torch.tensor(usual if joint_weights is None else joint_weights), False)
+        self.register_buffer("weights", torch.tensor(joint_weights or COUNTED, dtype=torch.float32), False)
 
     def residuals(self, joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, enlarge: Tensor) -> Tensor:
         """Rows (N, 2 K).
@@ -57,7 +58,20 @@ class Reprojection(SumOfSquares):
         """
         error = (joints_px - target_px) * enlarge[:, None, None]
         robust = error * self.scale_px / (self.scale_px**2 + error.square()).sqrt()
-        return (robust * (self.weights * confidence)[..., None]).flatten(1)
+        return self._weighted(robust, confidence).flatten(1)
+
+    def row_derivatives(
+        self, changes: Tensor, joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, enlarge: Tensor
+    ) -> Tensor:
+        """How the rows change with joints_px: (N, 2 K, P) of changes (N, K, 2, P)."""
+        error = (joints_px - target_px) * enlarge[:, None, None]
+        slope = self.scale_px**3 / (self.scale_px**2 + error.square()).pow(1.5) * enlarge[:, None, None]
+        return (self._weighted(slope, confidence)[..., None] * changes).flatten(1, 2)
+
+    def _weighted(self, rows: Tensor, confidence: Tensor) -> Tensor:
+        """Joints (N, K, 2) that nobody found count nothing, whatever stands there."""
+        weight = (self.weights * confidence)[..., None]
+        return torch.where(weight > 0, weight * rows, 0.0)
 
 
 class NaturalPose(SumOfSquares):
@@ -74,6 +88,10 @@ class NaturalPose(SumOfSquares):
     def residuals(self, pose: Tensor) -> Tensor:
         """Rows (N, 3 J - 2) of poses (N, 3 J) whose first three numbers, the heading, do not count."""
         return self.prior.residuals(pose[:, 3:])
+
+    def row_derivatives(self, changes: Tensor, pose: Tensor) -> Tensor:
+        """How the rows change with the pose: (N, 3 J - 2, P) of changes (N, 3 J, P); the component stays."""
+        return self.prior.row_derivatives(changes[:, 3:], pose[:, 3:])
 
 
 class NaturalBends(SumOfSquares):

@@ -19,8 +19,8 @@ from torch import Tensor
 from rendra.body import SMPL
 from rendra_lab.data.kept_tensors import kept_or_made
 from rendra_lab.errors import UserError
-from rendra_lab.synthesis.people import Crowd, Painter, draw_crowd
 from rendra_lab.settings import Fraction, Positive, check_numbers
+from rendra_lab.synthesis.people import Crowd, Painter, draw_crowd
 from rendra_lab.tasks.smplify.markers import MarkerSet
 from rendra_lab.tasks.smplify.people_data import PeopleData, Picture
 from rendra_lab.tasks.smplify.records import LSP_JOINTS, BodyTruth, PeopleBatch

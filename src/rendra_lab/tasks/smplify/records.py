@@ -1,7 +1,7 @@
 """What SMPLify is given and what it answers.
 
 Letters: N fits (a person may be fitted twice, from both sides), B people, K = 14 joints of the picture in LSP's
-order, J joints of the body, C betas, V vertices, S spheres.
+order, J joints of the body, C betas, V vertices.
 Pixels: x right, y down, the middle of the first pixel at 0.5.
 World: OpenCV's camera axes, x right, y down, z forward, metres; the camera stands at the origin.
 """
@@ -15,12 +15,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rendra_lab.records import TensorRecord
+from rendra_lab.tasks.smplify.body_spheres import Balls
 
 LSP_JOINTS = (
     "right_ankle", "right_knee", "right_hip", "left_hip", "left_knee", "left_ankle", "right_wrist", "right_elbow",
     "right_shoulder", "left_shoulder", "left_elbow", "left_wrist", "neck", "head_top",
 )  # fmt: skip
 
+
+COUNTED = tuple(name not in ("right_hip", "left_hip", "neck") for name in LSP_JOINTS)
+"""Joints that count: where people and bodies have their hips and neck differs by convention."""
 
 USUAL_HEIGHT_PX = 300.0
 """Of a person in the pictures that the weights of Bogo et al. were chosen for: LSP's, enlarged twice."""
@@ -76,7 +80,7 @@ class FitPrediction(TensorRecord):
     betas: Float[Tensor, "N C"]
     translation: Float[Tensor, "N 3"]
     joints_px: Float[Tensor, "N K 2"]
-    spheres: Float[Tensor, "N S 3"]  # middles of the balls that fill the body, in the world
+    spheres: Balls  # that fill the body
     person: Int[Tensor, " N"]  # whose fit this is
     is_flipped: Bool[Tensor, " N"]  # begun with the back to the camera instead of the front, or the other way round
     joints: Float[Tensor, "N J 3"] | None = None  # in the world; not while it is fitted

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 _LEAST_CURVATURE = 1e-3  # of a number that nothing pulls at
+_AT_REST = 1e4  # a lambda beyond it moves nothing: begin anew, for the objective may have changed since
 
 
 class Problem(Protocol):
@@ -93,11 +94,11 @@ class BatchedLevenbergMarquardt(LeastSquares):
             rival = self.problem.rows(x + step).square().sum(1)
             better = (rival < cost) & ~moved
             best = torch.where(better[:, None], x + step, best)
-            damping = torch.where(moved, damping, torch.where(better, damping / 4, damping * 6)).clamp(1e-8, 1e8)
+            damping = torch.where(moved, damping, torch.where(better, damping / 4, damping * 6)).clamp_min(1e-8)
             moved = moved | better
             if bool(moved.all()):
                 break
-        state["damping"] = damping
+        state["damping"] = torch.where(damping > _AT_REST, group["damping"], damping)
         return best
 
 

@@ -1,0 +1,83 @@
+"""How good fitted bodies are: in the picture, against the truth, and as bodies.
+
+Shapes: B people, K joints of the picture in LSP's order, J joints of the body. Errors are means over all people.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from rendra_lab.synthesis.joint_limits import within_limits
+from rendra_lab.tasks.smplify.body_spheres import Balls, limbs_inside_trunk
+from rendra_lab.tasks.smplify.records import COUNTED, BodyTruth
+
+_CONFIDENT = 0.5
+
+
+def joint_error_px(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor) -> Tensor:
+    """Mean distance (pixels) of the joints that count and were found, from where they were found."""
+    return _mean_of(joints_px, target_px, confidence > 0)
+
+
+def joint_error_percent(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, height_px: Tensor) -> Tensor:
+    """The same in percent of the person's size, of the confident joints alone (confidence of 0.5 and more)."""
+    scale = 100 / height_px[:, None, None]
+    return _mean_of(joints_px * scale, target_px * scale, confidence >= _CONFIDENT)
+
+
+def clean_error_px(joints_px: Tensor, truth: BodyTruth) -> Tensor:
+    """Mean distance (pixels) of the joints that count from the true ones."""
+    return _mean_of(joints_px, truth.clean_px, torch.ones_like(joints_px[..., 0], dtype=torch.bool))
+
+
+def mpjpe_mm(joints: Tensor, truth: BodyTruth) -> Tensor:
+    """Mean distance of joints (B, J, 3) from the true ones, both about their pelvis, in mm."""
+    return 1e3 * (_about_root(joints) - _about_root(truth.joints)).norm(dim=-1).mean()
+
+
+def pa_mpjpe_mm(joints: Tensor, truth: BodyTruth) -> Tensor:
+    """The same after the similarity that aligns each body best (Procrustes); "Protocol 2", in mm."""
+    return 1e3 * (aligned(joints, truth.joints) - truth.joints).norm(dim=-1).mean()
+
+
+def vertex_error_mm(verts: Tensor, truth: BodyTruth) -> Tensor:
+    """Mean distance of vertices (B, V, 3) from the true ones after a similarity, in mm; of the same mesh."""
+    return 1e3 * (aligned(verts, truth.verts) - truth.verts).norm(dim=-1).mean()
+
+
+def share_within_limits(pose: Tensor) -> Tensor:
+    """The share of poses (B, 3 J) with no joint beyond what people can."""
+    return within_limits(pose.reshape(len(pose), -1, 3)[:, :24]).float().mean()
+
+
+def share_limbs_outside(spheres: Balls) -> Tensor:
+    """The share of bodies with neither a forearm nor a hand inside the trunk."""
+    return (~limbs_inside_trunk(spheres)).float().mean()
+
+
+def share_flipped(is_flipped: Tensor) -> Tensor:
+    """How often the fit that began from the other side was better."""
+    return is_flipped.float().mean()
+
+
+def aligned(points: Tensor, target: Tensor) -> Tensor:
+    """Points (B, M, 3) after the rotation, scale and shift that bring them nearest to others (Umeyama, 1991)."""
+    middle, goal = points.mean(1, keepdim=True), target.mean(1, keepdim=True)
+    a, b = (points - middle).double(), (target - goal).double()
+    u, s, vt = torch.linalg.svd(a.transpose(1, 2) @ b)
+    mirror = torch.ones_like(s)
+    mirror[:, 2] = torch.linalg.det(u @ vt).sign()
+    rotation = u @ torch.diag_embed(mirror) @ vt
+    scale = (s * mirror).sum(1) / a.square().sum((1, 2)).clamp_min(1e-12)
+    return (scale[:, None, None] * (a @ rotation)).to(points.dtype) + goal
+
+
+def _about_root(joints: Tensor) -> Tensor:
+    return joints - joints[:, :1]
+
+
+def _mean_of(joints: Tensor, target: Tensor, found: Tensor) -> Tensor:
+    counts = found & torch.tensor(COUNTED, device=found.device)
+    distance = torch.where(counts, (joints - target).norm(dim=-1), 0.0)
+    return distance.sum() / counts.sum().clamp_min(1)
