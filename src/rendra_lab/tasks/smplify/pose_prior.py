@@ -191,6 +191,6 @@ def _floats(key: str, value: Any) -> Tensor:
         array = np.asarray(value)
         if array.dtype == object or array.dtype.kind not in "fiu":
             raise ValueError(f"its type is {array.dtype}")
-        return torch.from_numpy(np.ascontiguousarray(array, np.float64))
+        return torch.from_numpy(np.array(array, np.float64, order="C"))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{key} must be an array of numbers: {error}") from error

@@ -34,7 +34,7 @@ USUAL_HEIGHT_PX = 300.0
 class BodyTruth(TensorRecord):
     """The bodies themselves, where they are known."""
 
-    pose: Float[Tensor, "B J*3"]  # rotation vectors, the first one into the camera's axes
+    pose: Float[Tensor, "B P"]  # P = 3 J: rotation vectors, the first one into the camera's axes
     betas: Float[Tensor, "B C"]
     translation: Float[Tensor, "B 3"]
     joints: Float[Tensor, "B J 3"]
@@ -76,7 +76,7 @@ class PeopleBatch(TensorRecord):
 class FitPrediction(TensorRecord):
     """Bodies as they are fitted now."""
 
-    pose: Float[Tensor, "N J*3"]
+    pose: Float[Tensor, "N P"]  # P = 3 J
     betas: Float[Tensor, "N C"]
     translation: Float[Tensor, "N 3"]
     joints_px: Float[Tensor, "N K 2"]

@@ -5,14 +5,17 @@ Shapes: B people, K joints of the picture in LSP's order, J joints of the body. 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from rendra_lab.synthesis.joint_limits import within_limits
+from rendra_lab.synthesis.joint_limits import beyond_limits
 from rendra_lab.tasks.smplify.body_spheres import Balls, limbs_inside_trunk
 from rendra_lab.tasks.smplify.records import COUNTED, BodyTruth
 
 _CONFIDENT = 0.5
+_TOLERANCE_DEG = 10.0  # people differ
 
 
 def joint_error_px(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor) -> Tensor:
@@ -47,8 +50,9 @@ def vertex_error_mm(verts: Tensor, truth: BodyTruth) -> Tensor:
 
 
 def share_within_limits(pose: Tensor) -> Tensor:
-    """The share of poses (B, 3 J) with no joint beyond what people can."""
-    return within_limits(pose.reshape(len(pose), -1, 3)[:, :24]).float().mean()
+    """The share of poses (B, 3 J) with no joint more than 10 degrees beyond what people usually can."""
+    beyond = beyond_limits(pose.reshape(len(pose), -1, 3)[:, :24])[:, 1:]
+    return (beyond < math.radians(_TOLERANCE_DEG)).all(1).float().mean()
 
 
 def share_limbs_outside(spheres: Balls) -> Tensor:

@@ -138,7 +138,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
     @torch.no_grad()
     def place(self, batch: PeopleBatch) -> None:
         """Begin: bodies of the mean shape, where and how the torso says, in every pose to begin with."""
-        rest = self.markers(torch.zeros_like(self.x[:1])).points[0].float()
+        rest = self.markers(torch.zeros_like(self.x[:1])).points[0, : len(LSP_JOINTS)].float()
         heading, place, is_open = self.start(batch, rest)
         again = is_open.nonzero()[:, 0] if self.flip else torch.zeros(0, dtype=torch.int64)
         person = torch.cat([torch.arange(len(heading), device=heading.device), again])
@@ -158,6 +158,10 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         people = self.fits(batch)
         prediction = self.prediction_of(points, self.x, people)
         return prediction if self.training else self._best(prediction, batch, people)
+
+    def objective(self, prediction: FitPrediction, batch: PeopleBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `Task`: the sum over all fits."""
+        return super().objective(prediction, self.fits(batch))
 
     def problem(self, batch: PeopleBatch, step: int) -> BodyProblem:
         """What a solver is given before every step."""
