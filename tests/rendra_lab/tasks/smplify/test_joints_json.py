@@ -27,11 +27,11 @@ NECK, HEAD = LSP_JOINTS.index("neck"), LSP_JOINTS.index("head_top")
 OF_COUNT = {25: "openpose_body25", 18: "openpose_coco18", 17: "coco17", 33: "mediapipe33", 14: "lsp14"}
 
 
-def rows(layout: str, seed: int = 0, shift: float = 0.0) -> list[list[float]]:
+def rows(layout: str, seed: int = 0) -> list[list[float]]:
     """A person: x, y, confidence."""
     draw = np.random.default_rng(seed)
     count = len(LAYOUTS[layout].joints)
-    return np.concatenate([draw.uniform(5, 85, (count, 2)) + shift, draw.uniform(0.2, 1, (count, 1))], 1).tolist()
+    return np.concatenate([draw.uniform(5, 85, (count, 2)), draw.uniform(0.2, 1, (count, 1))], 1).tolist()
 
 
 def flat(triples: list[list[float]]) -> list[float]:
@@ -300,7 +300,7 @@ def test_huge_broken_and_missing_files_are_refused(tmp_path: Path, monkeypatch: 
     with pytest.raises(UserError, match="there is no file or folder"):
         people(tmp_path / "away.json")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="there is no .json file in"):
+    with pytest.raises(UserError, match=r"there is no \.json file in"):
         people(tmp_path / "empty")
 
 
@@ -327,7 +327,7 @@ BASES = [
     for tree in (
         pictures("lsp14", rows("lsp14")),
         openpose(rows("openpose_coco18")),
-        coco(flat(rows("coco17", shift=0.5)[:16] + [[1, 2, 2]])),
+        coco([*flat(rows("coco17"))[:48], 1, 2, 2]),
         [{"image_id": 3, "keypoints": flat(rows("coco17"))}],
         {"landmarks": [{"x": 0.5, "y": 0.5, "visibility": 1}] * 33},
     )
@@ -343,10 +343,12 @@ def test_damaged_files_are_read_or_refused(tmp_path: Path, base: int, steps) -> 
     try:
         batch = people(path, size=[120, 90]).people
     except UserError as error:
-        assert "\n" not in str(error)
+        said = str(error)
     else:
+        said = ""
         assert bool(batch.joints_px.isfinite().all())
         assert bool((batch.confidence.amax(1) > 0).all())
+    assert "\n" not in said
 
 
 def test_the_astronauts_joints_lie_upon_her(tmp_path: Path) -> None:
