@@ -1,11 +1,11 @@
 """Train, fit or reconstruct: `python train.py task=pose`; `python train.py --help` lists what there is."""
 
-from typing import Any
-
 if __name__ == "__main__":  # first of all: what follows takes a second to load
     from rendra_lab.signals import leave_at_once
 
     leave_at_once()
+
+from typing import Any
 
 import hydra
 

@@ -159,6 +159,12 @@ def check_value(value: Any, hint: Any, key: str) -> None:
     raise UserError(f"{key} must be {wanted}, got {_shown(value)}{advice}")
 
 
+def check_numbers(group: str, hint: Any, **numbers: float | None) -> None:
+    """Refuses numbers that an annotation excludes, for the constructor that got them; UserError with `group.name`."""
+    for name, number in numbers.items():
+        check_value(number, hint, f"{group}.{name}")
+
+
 def rehearse(optimizer: Callable[..., Any] | None, scheduler: Callable[..., Any] | None) -> None:
     """Makes both once with one weight, so that what they refuse is known before a fit begins; UserError."""
     if optimizer is None:

@@ -61,7 +61,7 @@ class Sweeps:
         lines = path.read_text().splitlines() if path.exists() else []
         return [line.split()[1:] for line in lines if line.startswith(f"{what} ")]
 
-    def wait_for(self, what: str, count: int, timeout: float = 90) -> None:
+    def wait_for(self, what: str, count: int, timeout: float = 300) -> None:
         deadline = time.monotonic() + timeout
         while len(self.diary(what)) < count:
             assert time.monotonic() < deadline, self.said()

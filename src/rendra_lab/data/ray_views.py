@@ -23,12 +23,13 @@ from rendra_lab.data.repeated import StepByStep
 from rendra_lab.data.shares import Share
 from rendra_lab.errors import UserError
 from rendra_lab.records import TensorRecord
-from rendra_lab.settings import Count, Fraction, Positive, Range
+from rendra_lab.settings import Count, Fraction, Positive, Range, check_numbers
 
 RayWarp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Takes rays, origins (Q, 3) and unit directions (Q, 3), to those of a bent space: the same shapes and lengths."""
 
 _FOCUS_MARGIN_PX = 3
+_Side = Annotated[float, Range(0, 1, closed=False)]  # a part of the side of an image
 BACKGROUNDS = {"white": 1.0, "black": 0.0, "random": None}
 
 
@@ -178,7 +179,7 @@ def _as_view(flat: RayBatch, images: PosedImages, index: int) -> RayBatch:
 
 
 class RandomPixels(StepByStep[RayBatch]):
-    """Endless random pixels of the training images; one pass is one epoch of `steps` batches.
+    """Endless random pixels of the training images, new ones in each epoch of `steps` batches.
 
     The random numbers of a step follow from seed and step alone, so a resumed run sees what it would have seen, and
     processes that divide a step see together what one alone would.
@@ -260,7 +261,7 @@ class SceneViews(LightningDataModule, ABC):
     Args:
         rays_per_step: rays of a training step, of all of its pixels.
         rays_per_pixel_side: rays of a pixel along each of its sides; a pixel's colour is the mean of its rays. Or
-            pairs [step, side], each side from that step of an epoch on; what is not trained on gets the last one.
+            pairs [step, side], each side from that step on; what is not trained on gets the last one.
         background: white, black or random, behind what images leave transparent.
         views_per_step: images that the pixels of a step come from; null takes all.
         precrop: share of the sides of an image, about its middle, that the first steps see.
@@ -278,7 +279,7 @@ class SceneViews(LightningDataModule, ABC):
         rays_per_pixel_side: int | Sequence[Sequence[int]] = 1,
         background: str = "white",
         views_per_step: int | None = None,
-        precrop: Annotated[float, Range(0, 1, closed=False)] = 1.0,
+        precrop: _Side = 1.0,
         precrop_steps: Count = 0,
         jitter: bool = False,
         focus: Fraction = 0.0,
@@ -288,15 +289,10 @@ class SceneViews(LightningDataModule, ABC):
         super().__init__()
         if background not in BACKGROUNDS:
             raise UserError(f"data.background must be one of {', '.join(BACKGROUNDS)}, got {background!r}")
-        _at_least_one(
-            rays_per_step=rays_per_step,
-            views_per_step=views_per_step,
-            steps=steps,
-        )
-        if not 0 < precrop <= 1:
-            raise UserError(f"data.precrop is a share of an image's sides, in (0, 1], got {precrop}")
-        if not 0 <= focus <= 1:
-            raise UserError(f"data.focus is a share of the pixels, in [0, 1], got {focus}")
+        check_numbers("data", Positive, rays_per_step=rays_per_step, steps=steps)
+        check_numbers("data", Positive | None, views_per_step=views_per_step)
+        check_numbers("data", _Side, precrop=precrop)
+        check_numbers("data", Fraction, focus=focus)
         self.rays_per_step = rays_per_step
         self.sides = _schedule(rays_per_pixel_side)
         self.background = background
@@ -371,9 +367,3 @@ def _schedule(sides: int | Sequence[Sequence[int]]) -> list[tuple[int, int]]:
     if not pairs or steps[0] != 0 or sorted(steps) != steps or min(side for _, side in pairs) < 1:
         raise complaint
     return pairs
-
-
-def _at_least_one(**numbers: int | None) -> None:
-    for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise UserError(f"data.{name} must be at least 1, got {number}")

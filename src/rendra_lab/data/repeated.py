@@ -10,10 +10,9 @@ BatchT = TypeVar("BatchT")
 
 
 class StepByStep(ABC, Generic[BatchT]):
-    """Yields the batches of an epoch, one a step; the next pass yields the same."""
+    """Yields the batches of a fit, one a step; each pass is an epoch, and goes on where the one before has ended."""
 
     _given = 0
-    _resume_at = 0
 
     @abstractmethod
     def __len__(self) -> int:
@@ -21,21 +20,20 @@ class StepByStep(ABC, Generic[BatchT]):
 
     @abstractmethod
     def batch_of(self, step: int) -> BatchT:
-        """What a step gets; steps are counted from 0 in each epoch."""
+        """What a step gets; steps are counted from 0 through all epochs."""
 
     def __iter__(self) -> Iterator[BatchT]:
-        start, self._resume_at = self._resume_at, 0
-        for step in range(start, len(self)):
-            self._given = step + 1
-            yield self.batch_of(step)
+        for _ in range(len(self)):
+            self._given += 1
+            yield self.batch_of(self._given - 1)
 
     def state_dict(self) -> dict[str, int]:
-        """How far the running epoch is; Lightning keeps it in checkpoints."""
+        """How many batches were given; Lightning keeps it in checkpoints."""
         return {"given": self._given}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Lets the next epoch be the rest of one that a checkpoint interrupted."""
-        self._resume_at = min(state["given"], len(self)) % len(self)
+        """Lets the next pass go on where a checkpoint was written; Lightning ends it where the epoch ends."""
+        self._given = state["given"]
 
 
 class Repeated(StepByStep[BatchT]):

@@ -32,7 +32,7 @@ class FrameByFrame(StepByStep[ViewBatch]):
 
     def batch_of(self, step: int) -> ViewBatch:
         """The frame of a step."""
-        return self.frames[step // self.times]
+        return self.frames[step // self.times % len(self.frames)]
 
 
 class RenderedSequence(LightningDataModule):

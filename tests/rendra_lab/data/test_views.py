@@ -95,7 +95,7 @@ def test_a_resumed_sequence_goes_on_where_it_was(scene):
     data.setup("fit")
     resumed = FrameByFrame(data.views, 2)
     resumed.load_state_dict({"given": 3})
-    assert [int(batch.frame) for batch in resumed] == [1, 2, 2]
+    assert [int(batch.frame) for batch in resumed] == [1, 2, 2, 0, 0, 1]
 
 
 def empty_views(scene):

@@ -369,14 +369,14 @@ def test_opacities_that_ignore_lengths_are_refused_with_a_remedy() -> None:
 
 @pytest.mark.parametrize("wrong", ["cells", "steps_across", "refresh_every", "rays_at_once"])
 def test_numbers_below_one_are_refused(wrong: str) -> None:
-    with pytest.raises(ValueError, match=rf"sampler\.{wrong} must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=rf"sampler\.{wrong} must be a whole number of at least 1, got 0"):
         OccupancyRenderer(Fog(), **{wrong: 0})
 
 
 @pytest.mark.parametrize("wrong", ["empty_below", "decay", "stop_below"])
 @pytest.mark.parametrize("value", [-0.1, 1.5, math.nan])
 def test_shares_lie_between_zero_and_one(wrong: str, value: float) -> None:
-    with pytest.raises(UserError, match=rf"sampler\.{wrong} is a share, in \[0, 1\], got {value}"):
+    with pytest.raises(UserError, match=rf"sampler\.{wrong} must be a number from 0 to 1, got {value}"):
         OccupancyRenderer(Fog(), **{wrong: value})
 
 

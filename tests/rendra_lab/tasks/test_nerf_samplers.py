@@ -177,7 +177,7 @@ def test_a_wrong_depth_range_is_refused(wrong: list[float]) -> None:
 
 
 def test_too_few_samples_are_refused() -> None:
-    with pytest.raises(UserError, match=r"sampler\.samples must be at least 2, got 1"):
+    with pytest.raises(UserError, match=r"sampler\.samples must be a whole number of at least 2, got 1"):
         StratifiedRenderer(Fog(), samples=1)
     with pytest.raises(UserError, match=r"sampler\.coarse_samples"):
         HierarchicalRenderer(Fog(), Fog(), coarse_samples=2)

@@ -101,23 +101,23 @@ def test_steps_and_densities_are_above_nothing(wrong: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("made", [lambda **how: VolumeGrid((8,), **how), lambda **how: BookVolume(8, **how)])
 def test_rays_are_rendered_one_at_a_time_or_more(made: Callable[..., nn.Module]) -> None:
-    with pytest.raises(UserError, match=r"volume\.rays_at_once must be at least 1, got 0"):
+    with pytest.raises(UserError, match=r"volume\.rays_at_once must be a whole number of at least 1, got 0"):
         made(rays_at_once=0)
 
 
 @pytest.mark.parametrize("wrong", [{"empty_below": -0.1}, {"stop_below": 1.5}, {"stop_below": float("nan")}])
 def test_shares_lie_between_zero_and_one(wrong: dict[str, float]) -> None:
     (name,) = wrong
-    with pytest.raises(UserError, match=rf"volume\.{name} is a share, in \[0, 1\], got"):
+    with pytest.raises(UserError, match=rf"volume\.{name} must be a number from 0 to 1, got"):
         VolumeGrid((8,), **wrong)
 
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"voxels": 1}, r"volume\.voxels must be at least 2, got 1"),
-        ({"samples": 1}, r"volume\.samples must be at least 2, got 1"),
-        ({"side": 0.0}, r"volume\.side must be above 0, got 0"),
+        ({"voxels": 1}, r"volume\.voxels must be a whole number of at least 2, got 1"),
+        ({"samples": 1}, r"volume\.samples must be a whole number of at least 2, got 1"),
+        ({"side": 0.0}, r"volume\.side must be a number above 0, got 0"),
         ({"depth_range": (3.0, 0.1)}, r"volume\.depth_range is two ascending distances.*got \[3\.0, 0\.1\]"),
         ({"depth_range": (0.1,)}, r"volume\.depth_range is two ascending distances"),
     ],

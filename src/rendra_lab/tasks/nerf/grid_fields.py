@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from rendra.kernels.composite import alphas_of
 from rendra_lab.errors import UserError
-from rendra_lab.number_checks import check_above_zero, check_at_least
-from rendra_lab.settings import Count, Positive
+from rendra_lab.settings import Count, Positive, Size, check_numbers
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 _LARGEST_EXPONENT = 12.0  # exp(12) per unit of length is opaque at every step anybody takes
@@ -74,9 +73,9 @@ class GridField(RadianceField):
         start_density: float = 1.0,
     ) -> None:
         super().__init__()
-        check_at_least(1, "field", width=width)
-        check_at_least(0, "field", density_layers=density_layers, color_layers=color_layers, memory=memory)
-        check_above_zero("field", start_density=start_density)
+        check_numbers("field", Positive, width=width)
+        check_numbers("field", Count, density_layers=density_layers, color_layers=color_layers, memory=memory)
+        check_numbers("field", Size, start_density=start_density)
         if memory == 0 and directions is None:
             raise UserError("field.memory is 0 and field.directions null: then light depends on nothing")
         self.encoding: Encoding = encoding

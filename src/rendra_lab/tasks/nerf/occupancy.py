@@ -18,8 +18,7 @@ from rendra_lab.data.scene_box import carve, cells_along
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
 from rendra_lab.networks.sizes import take_sizes
-from rendra_lab.number_checks import check_at_least, check_shares
-from rendra_lab.settings import Count, Fraction
+from rendra_lab.settings import Count, Fraction, Positive, check_numbers
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 
@@ -71,8 +70,8 @@ class OccupancyRenderer(RayRenderer):
         rays_at_once: int = 65536,
     ) -> None:
         super().__init__(field, rays_at_once)
-        check_at_least(1, "sampler", cells=cells, steps_across=steps_across, refresh_every=refresh_every)
-        check_shares("sampler", empty_below=empty_below, decay=decay, stop_below=stop_below)
+        check_numbers("sampler", Positive, cells=cells, steps_across=steps_across, refresh_every=refresh_every)
+        check_numbers("sampler", Fraction, empty_below=empty_below, decay=decay, stop_below=stop_below)
         if not field.is_density:
             raise UserError(
                 f"sampler=occupancy needs a field of densities, and a sample of {type(field).__name__} is as opaque "

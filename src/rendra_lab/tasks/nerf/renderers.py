@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from rendra_lab.data.ray_views import Scene
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
-from rendra_lab.number_checks import check_at_least
+from rendra_lab.settings import Positive, check_numbers
 from rendra_lab.tasks.nerf.fields import RadianceField
 
 
@@ -23,7 +23,7 @@ class RayRenderer(nn.Module, ABC):
 
     def __init__(self, field: RadianceField, rays_at_once: int = 8192) -> None:
         super().__init__()
-        check_at_least(1, "sampler", rays_at_once=rays_at_once)
+        check_numbers("sampler", Positive, rays_at_once=rays_at_once)
         self.field = field
         self.rays_at_once = rays_at_once
 

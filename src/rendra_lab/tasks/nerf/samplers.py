@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from rendra.ops.sample_pdf import sample_pdf
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen
-from rendra_lab.number_checks import check_at_least
+from rendra_lab.settings import Positive, Range, check_numbers
 from rendra_lab.tasks.nerf.fields import RadianceField
 from rendra_lab.tasks.nerf.renderers import RayRenderer
 
@@ -118,7 +118,7 @@ class StratifiedRenderer(DenseRenderer):
 
     def __init__(self, field: RadianceField, samples: int = 128, **marching: Any) -> None:
         super().__init__(field, **marching)
-        check_at_least(2, "sampler", samples=samples)
+        check_numbers("sampler", Annotated[int, Range(2)], samples=samples)
         self.samples = samples
 
     def look(self, rays: Rays) -> RaysSeen:
@@ -146,8 +146,8 @@ class HierarchicalRenderer(DenseRenderer):
         **marching: Any,
     ) -> None:
         super().__init__(field, **marching)
-        check_at_least(3, "sampler", coarse_samples=coarse_samples)
-        check_at_least(1, "sampler", fine_samples=fine_samples)
+        check_numbers("sampler", Annotated[int, Range(3)], coarse_samples=coarse_samples)
+        check_numbers("sampler", Positive, fine_samples=fine_samples)
         self.coarse = coarse
         self.coarse_samples = coarse_samples
         self.fine_samples = fine_samples

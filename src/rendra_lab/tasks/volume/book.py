@@ -6,6 +6,7 @@ Shapes: Q rays, M points, n voxels along each side.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +16,9 @@ from rendra.kernels.march_volume import march_volume
 from rendra_lab.data.ray_views import Scene
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
-from rendra_lab.number_checks import check_above_zero, check_at_least
-from rendra_lab.settings import Positive, Size
+from rendra_lab.settings import Positive, Range, Size, check_numbers
+
+_Several = Annotated[int, Range(2)]
 
 
 class BookVolume(nn.Module):
@@ -39,17 +41,17 @@ class BookVolume(nn.Module):
 
     def __init__(
         self,
-        voxels: Positive = 128,
+        voxels: _Several = 128,
         side: Size = 3.0,
-        samples: Positive = 150,
+        samples: _Several = 150,
         depth_range: Sequence[float] = (0.1, 3.0),
         start: float = -4.0,
-        rays_at_once: int = 65536,
+        rays_at_once: Positive = 65536,
     ) -> None:
         super().__init__()
-        check_at_least(2, "volume", voxels=voxels, samples=samples)
-        check_at_least(1, "volume", rays_at_once=rays_at_once)
-        check_above_zero("volume", side=side)
+        check_numbers("volume", _Several, voxels=voxels, samples=samples)
+        check_numbers("volume", Positive, rays_at_once=rays_at_once)
+        check_numbers("volume", Size, side=side)
         if len(depth_range) != 2 or not 0 <= depth_range[0] < depth_range[1]:
             raise UserError(
                 f"volume.depth_range is two ascending distances, such as [0.1, 3.0]; got {[*depth_range]}"

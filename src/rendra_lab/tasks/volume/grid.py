@@ -21,8 +21,7 @@ from rendra_lab.data.scene_box import carve, cells_along
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import Rays, RaysSeen, in_pieces
 from rendra_lab.networks.sizes import take_sizes
-from rendra_lab.number_checks import check_above_zero, check_at_least, check_shares
-from rendra_lab.settings import Fraction
+from rendra_lab.settings import Fraction, Positive, Size, check_numbers
 
 _UNITS_ACROSS = 100.0  # units of length along the longest side of the box: densities are then about as large as 1
 _SHORTEST = 1e-9  # step of a ray without length, as a share of others
@@ -89,9 +88,9 @@ class VolumeGrid(nn.Module):
             raise UserError(
                 f"volume.voxels are numbers of voxels, at least 2, rising from level to level, got {voxels}"
             )
-        check_above_zero("volume", steps_per_voxel=steps_per_voxel, start_density=start_density)
-        check_shares("volume", empty_below=empty_below, stop_below=stop_below)
-        check_at_least(1, "volume", rays_at_once=rays_at_once)
+        check_numbers("volume", Size, steps_per_voxel=steps_per_voxel, start_density=start_density)
+        check_numbers("volume", Fraction, empty_below=empty_below, stop_below=stop_below)
+        check_numbers("volume", Positive, rays_at_once=rays_at_once)
         self.voxels = list(voxels)
         self.steps_per_voxel = steps_per_voxel
         self.start_density = start_density
