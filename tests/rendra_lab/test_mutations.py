@@ -148,7 +148,8 @@ def answers_to(mistakes: dict[str, str], folder: Path) -> dict[str, Answer]:
     (broken / "typo.yaml").write_text("# @package _global_\ndefaults:\n  - override /taks: pose\n")
     words = [text.split(" ") for text in mistakes]
     split = [(line[0], line[1:]) if line[0].endswith(".py") else ("train.py", line) for line in words]
-    return dict(zip(mistakes, run_commands([Command(*each) for each in split], folder), strict=True))
+    commands = [*(Command(*each) for each in split), Command("train.py", ["los=[a]"], {"HYDRA_FULL_ERROR": "1"})]
+    return dict(zip([*mistakes, "verbose"], run_commands(commands, folder), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -180,10 +181,9 @@ def test_a_mistake_in_a_task_is_told_in_one_line(mistake: str, slow_answers: dic
     assert_one_line(slow_answers[mistake], SLOW[mistake])
 
 
-def test_a_traceback_can_be_asked_for(tmp_path: Path) -> None:
-    (answer,) = run_commands([Command("train.py", ["optimzer=adam"], {"HYDRA_FULL_ERROR": "1"})], tmp_path)
-    assert answer.code == 1
-    assert "Traceback" in answer.err
+def test_a_traceback_can_be_asked_for(fast_answers: dict[str, Answer]) -> None:
+    assert fast_answers["verbose"].code == 1
+    assert "Traceback" in fast_answers["verbose"].err
 
 
 def knobs(node: Any, key: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
