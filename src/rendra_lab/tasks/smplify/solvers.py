@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ _LEAST_CURVATURE = 1e-3  # of a number that nothing pulls at
 _AT_REST = 1e4  # a lambda beyond it moves nothing: begin anew, for the objective may have changed since
 
 
+@runtime_checkable
 class Problem(Protocol):
     """N problems of P numbers each."""
 
