@@ -32,7 +32,7 @@ from rendra_lab.synthesis.backgrounds import draw_background
 from rendra_lab.synthesis.poses import FAMILY_NAMES, draw_poses
 
 LARGEST_BETA = 2.5
-_ROUNDS = 12  # of moving a body until it fills its share of the picture
+_ROUNDS = 60  # at most, of moving bodies until they fill their share of the picture
 _AT_ONCE = 64  # bodies that are posed together
 _SAMPLES = 2  # of a pixel along each side
 _FILLS = (0.6, 0.86)  # share of the picture's height or width, whichever is filled more
@@ -137,8 +137,11 @@ def _framed(verts: Tensor, focal_px: Tensor, size: tuple[int, int], generator: t
         scale = ((most - least) / (fills * whole)).amax(1)
         depth = torch.maximum(depth * scale, 0.4 - deep)
         spare = (whole * (1 - 2 * _MARGIN) - (most - least)).clamp_min(0)
-        off = (place * spare - (least + most)) / 2 / focal_px[:, None] * depth[:, None]
-        move = torch.cat([move[:, :2] + off, (depth - middle[:, 2])[:, None]], dim=1)
+        off = (place * spare - (least + most)) / 2
+        shift = off / focal_px[:, None] * depth[:, None]
+        move = torch.cat([move[:, :2] + shift, (depth - middle[:, 2])[:, None]], dim=1)
+        if bool(((scale - 1).abs() < 1e-3).all() & (off.abs() < 0.1).all()):
+            break
     return move
 
 
