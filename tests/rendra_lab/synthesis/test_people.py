@@ -65,7 +65,7 @@ def test_no_people_and_the_same_people_again(body: SMPL) -> None:
 
 
 def test_a_picture_shows_the_person_where_the_joints_are(body: SMPL, crowd: Crowd) -> None:
-    """Painted twice before other backgrounds, only the person's pixels would stay: the silhouette holds the joints."""
+    """The same every time, and what is drawn covers the pixels that the vertices are projected to."""
     painter = Painter(body)
     picture = painter.paint(crowd, 3)
     assert picture.shape == (120, 90, 3)
