@@ -216,7 +216,7 @@ def _whole(name: str, arrays: Mapping[str, Any]) -> np.ndarray:
     array = _numbers(name, arrays)
     if array.dtype.kind == "f" and not (np.isfinite(array).all() and (array == np.round(array)).all()):
         raise ValueError(f"{name} holds numbers that are not whole")
-    return np.ascontiguousarray(array, np.int64)
+    return np.array(array, np.int64, order="C")
 
 
 def _floats(name: str, arrays: Mapping[str, Any]) -> Tensor:
