@@ -370,8 +370,17 @@ def test_the_astronauts_joints_lie_upon_her(tmp_path: Path) -> None:
 def test_configurations_say_the_defaults(of: type) -> None:
     module = of.__module__
     file = Path(__file__).parents[4] / "conf" / "data" / f"{module.rpartition('.')[2]}.yaml"
-    settings = OmegaConf.to_container(OmegaConf.load(file))
+    settings = OmegaConf.to_container(OmegaConf.load(file).data)
     assert settings.pop("_target_") == f"{module}.{of.__name__}"
     defaults = {name: each.default for name, each in inspect.signature(of).parameters.items() if name != "steps"}
     defaults["path"] = "???"
     assert settings == defaults
+
+
+@pytest.mark.parametrize("data", ["lsp", "joints_json"])
+def test_people_of_files_are_not_asked_for_their_truth(data: str, compose, tmp_path: Path) -> None:
+    cfg = compose(tmp_path / "smplify" / "run", "task=smplify", f"data={data}", "data.path=there")
+    asked = [name for name, term in cfg.metric.items() if term is not None]
+    assert "joints_percent" in asked
+    assert not [name for name in asked if cfg.metric[name].target == "truth"]
+    assert cfg.optimized_metric == "test/joints_percent"
