@@ -71,8 +71,8 @@ def _save_sheets(body: Any, studio: Any, folder: Path, sheets: list[str]) -> Ite
     from rendra_lab.visualization import save_picture
 
     for name in sheets:
-        make = {"betas": beta_sheet, "joints": joint_sheet}[name]
-        yield save_picture(folder / f"sheet_{name}.png", make(body, studio))
+        sheet = beta_sheet(body, studio) if name == "betas" else joint_sheet(body, studio)
+        yield save_picture(folder / f"sheet_{name}.png", sheet)
 
 
 if __name__ == "__main__":
