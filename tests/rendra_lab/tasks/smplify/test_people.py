@@ -1,6 +1,7 @@
 """data=people: what a detector would see of bodies that are known, pictures made when looked at, and folders."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,14 @@ def test_a_folder_of_people_is_read_by_the_readers_of_others(body: SMPL, tmp_pat
         torch.testing.assert_close(reader.people.joints_px[found], made.people.joints_px[found])
         torch.testing.assert_close(reader.people.confidence, made.people.confidence)
         assert np.array_equal(reader.picture(2), made.picture(2))  # type: ignore[arg-type]
+
+
+def test_generate_data_writes_people(program: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    settings = ("data=people", "body=free_low", "data.count=2", "data.image_size=32", "data.cache=null")
+    code, out, error = program("scripts/generate_data.py", *settings, f"output={tmp_path / 'made'}")
+    assert (code, error) == (0, "")
+    assert out.endswith(f"{tmp_path / 'made'}\n")
+    assert sorted(path.name for path in (tmp_path / "made").iterdir()) == ["est_joints.npz", "images", "people.json"]
 
 
 def test_only_such_folders_are_overwritten(body: SMPL, tmp_path: Path) -> None:
