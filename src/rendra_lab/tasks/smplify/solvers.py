@@ -48,7 +48,7 @@ class LeastSquares(torch.optim.Optimizer):
     needs_problem = True
     problem: Problem
 
-    def __init__(self, params: Any, **defaults: float) -> None:
+    def __init__(self, params: Any, **defaults: Any) -> None:
         super().__init__(params, defaults)
         if len(self.param_groups) != 1 or len(self.param_groups[0]["params"]) != 1:
             raise ValueError(f"{type(self).__name__} moves one parameter (N, P)")
