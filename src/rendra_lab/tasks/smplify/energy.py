@@ -112,6 +112,11 @@ class NaturalBends(SumOfSquares):
         """Rows (N, 4) of poses (N, 3 J)."""
         return 10 * (self.steepness * self.signs * pose.index_select(1, self.columns)).exp()
 
+    def row_derivatives(self, changes: Tensor, pose: Tensor) -> Tensor:
+        """How the rows change with the pose: (N, 4, P) of changes (N, 3 J, P)."""
+        slope = self.steepness * self.signs * self.residuals(pose)
+        return slope[..., None] * changes.index_select(1, self.columns)
+
 
 class UsualShape(SumOfSquares):
     """Betas of variance 1 are small."""
@@ -119,3 +124,7 @@ class UsualShape(SumOfSquares):
     def residuals(self, betas: Tensor) -> Tensor:
         """Betas (N, B) themselves."""
         return betas
+
+    def row_derivatives(self, changes: Tensor, betas: Tensor) -> Tensor:
+        """Those of the betas: (N, B, P)."""
+        return changes

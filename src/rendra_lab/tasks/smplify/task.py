@@ -16,7 +16,6 @@ from rendra.body import SMPL, SMPL_JOINTS
 from rendra_lab.base_task import Task
 from rendra_lab.errors import UserError
 from rendra_lab.networks.sizes import take_sizes
-from rendra_lab.records import RecordT
 from rendra_lab.tasks.smplify.body_spheres import BodySpheres
 from rendra_lab.tasks.smplify.camera_start import CameraStart
 from rendra_lab.tasks.smplify.markers import Marker, MarkerSet, Motion
@@ -224,7 +223,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _as_floats(record: RecordT, dtype: torch.dtype) -> RecordT:
+def _as_floats(record: Any, dtype: torch.dtype) -> Any:
     return record._map(
         lambda value: value.to(dtype), lambda value: isinstance(value, Tensor) and value.is_floating_point()
     )
