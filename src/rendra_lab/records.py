@@ -95,6 +95,8 @@ def read_field(record: Any, name: str, role: str) -> Any:
 def _map_value(value: Any, move: Callable[[Any], Any], movable: Callable[[Any], bool]) -> Any:
     if movable(value):
         return move(value)
+    if isinstance(value, TensorRecord):
+        return value._map(move, movable)
     if isinstance(value, Mapping):
         return {key: _map_value(item, move, movable) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -88,3 +88,10 @@ def test_named_tuples_stay_what_they_are() -> None:
 def test_a_field_that_would_hide_a_method_is_refused(name: str) -> None:
     with pytest.raises(TypeError, match=f"Hiding.{name} would hide TensorRecord.{name}"):
         type("Hiding", (TensorRecord,), {"__annotations__": {name: Tensor}})
+
+
+def test_a_change_of_all_tensors_reaches_the_records_within() -> None:
+    first = outer()
+    halved = first._map(lambda value: value[:1], lambda value: isinstance(value, Tensor))
+    assert halved.inner.value.shape == (1, 2)
+    assert first.inner.value.shape == (3, 2)

@@ -169,7 +169,8 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
     def fits(self, batch: PeopleBatch) -> PeopleBatch:
         """The people of a batch, one for each fit."""
         if self._batches is None or self._batches[0] is not batch:
-            self._batches = batch, _as_floats(batch.select(self.person), torch.float64)
+            people = replace(batch, truth=None).select(self.person)  # which no term knows
+            self._batches = batch, _as_floats(people, torch.float64)
         return self._batches[1]
 
     def terms(self) -> list[LossTerm]:
