@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +48,7 @@ class PeopleData(LightningDataModule, ABC):
     def setup(self, stage: str) -> None:
         """Lightning's hook: loads the people once."""
         if not hasattr(self, "people"):
-            self.people = self.load()
+            self.people = replace(self.load(), picture_of=self.picture)
 
     def picture(self, person: int | str) -> Picture | None:
         """The picture that a person is in, read now.

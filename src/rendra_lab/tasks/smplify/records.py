@@ -8,7 +8,9 @@ World: OpenCV's camera axes, x right, y down, z forward, metres; the camera stan
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,6 +55,7 @@ class PeopleBatch(TensorRecord):
     center_px: Float[Tensor, "B 2"]  # principal point, x and y
     pictures: tuple[str, ...]  # what each picture is called: a path, or a name where there is none
     truth: BodyTruth | None = None
+    picture_of: Callable[[int], Any] | None = None  # (H, W, 3) uint8, or None: read when asked for
 
     @property
     def height_px(self) -> Float[Tensor, " B"]:

@@ -10,12 +10,20 @@ import math
 import torch
 from torch import Tensor
 
-from rendra_lab.synthesis.joint_limits import beyond_limits
+from rendra.body import SMPL, SMPL_JOINTS
+from rendra_lab.synthesis.joint_limits import beyond_limits, joint_angles
 from rendra_lab.tasks.smplify.body_spheres import Balls, limbs_inside_trunk
 from rendra_lab.tasks.smplify.records import COUNTED, BodyTruth
 
 _CONFIDENT = 0.5
 _TOLERANCE_DEG = 10.0  # people differ
+_BACKWARDS = tuple(
+    (SMPL_JOINTS.index(name), axis, sign)
+    for name, axis, sign in (
+        ("left_elbow", 1, 1.0), ("right_elbow", 1, -1.0), ("left_knee", 0, -1.0), ("right_knee", 0, -1.0)
+    )
+)  # fmt: skip
+"""Elbows and knees: the angle that grows, or falls, as they are bent the wrong way."""
 
 
 def joint_error_px(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor) -> Tensor:
@@ -55,6 +63,18 @@ def share_within_limits(pose: Tensor) -> Tensor:
     return (beyond < math.radians(_TOLERANCE_DEG)).all(1).float().mean()
 
 
+def share_bends_natural(pose: Tensor) -> Tensor:
+    """The share of elbows and knees of poses (B, 3 J) that are not bent backwards by more than 10 degrees."""
+    angles = joint_angles(pose.reshape(len(pose), -1, 3)[:, :24])
+    backwards = torch.stack([sign * angles[:, joint, axis] for joint, axis, sign in _BACKWARDS], dim=1)
+    return (backwards < math.radians(_TOLERANCE_DEG)).float().mean()
+
+
+def beta_size(betas: Tensor) -> Tensor:
+    """The root mean square of betas (B, C); 1 for people as they are."""
+    return betas.square().mean().sqrt()
+
+
 def share_limbs_outside(spheres: Balls) -> Tensor:
     """The share of bodies with neither a forearm nor a hand inside the trunk."""
     return (~limbs_inside_trunk(spheres)).float().mean()
@@ -63,6 +83,22 @@ def share_limbs_outside(spheres: Balls) -> Tensor:
 def share_flipped(is_flipped: Tensor) -> Tensor:
     """How often the fit that began from the other side was better."""
     return is_flipped.float().mean()
+
+
+class ShapeError:
+    """Mean distance of the vertices of bodies at rest from those of the true shapes, pelvis on pelvis, in mm.
+
+    Args:
+        body: whose betas they are.
+    """
+
+    def __init__(self, body: SMPL) -> None:
+        self.moves = body.shapedirs - body.joint_shapedirs[0]  # (V, 3, C) about the pelvis, linear in betas
+
+    def __call__(self, betas: Tensor, truth: BodyTruth) -> Tensor:
+        """Of betas (B, C)."""
+        moves = self.moves.to(betas)
+        return 1e3 * torch.stack([(moves @ apart).norm(dim=-1).mean() for apart in betas - truth.betas]).mean()
 
 
 def aligned(points: Tensor, target: Tensor) -> Tensor:

@@ -16,9 +16,11 @@ from rendra.body import SMPL, SMPL_JOINTS
 from rendra_lab.base_task import Task
 from rendra_lab.errors import UserError
 from rendra_lab.networks.sizes import take_sizes
+from rendra_lab.settings import Count
 from rendra_lab.tasks.smplify.body_spheres import BodySpheres
 from rendra_lab.tasks.smplify.camera_start import CameraStart
 from rendra_lab.tasks.smplify.markers import Marker, MarkerSet, Motion
+from rendra_lab.tasks.smplify.portraits import Portraits, sheet_of
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
 from rendra_lab.tasks.smplify.records import LSP_JOINTS, FitPrediction, PeopleBatch
 from rendra_lab.terms import LossTerm
@@ -89,6 +91,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         flip: also begin from behind where the start leaves it open.
         choose: which of a person's fits counts: that of the least `objective`, or whose joints lie best in the
             `picture`, as Bogo et al. choose between the two sides.
+        shown: people in the panels, from the first on.
         **parts: losses, metrics, optimizer, scheduler of `Task`.
 
     Raises:
@@ -105,6 +108,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         poses: PosePrior | None = None,
         flip: bool = True,
         choose: str = "objective",
+        shown: Count = 4,
         **parts: Any,
     ) -> None:
         super().__init__(**parts)
@@ -121,6 +125,8 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         self.poses = poses
         self.flip = flip
         self.choose = choose
+        self.shown = shown
+        self.portraits = Portraits(body.faces, size=192)
         self.spheres = BodySpheres(body)
         markers = [*picture_markers(body), *self.spheres.markers]
         self.markers = MarkerSet(body, markers).double()  # objectives that differ in their ninth digit only
@@ -157,6 +163,13 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         people = self.fits(batch)
         prediction = self.prediction_of(points, self.x, people)
         return prediction if self.training else self._best(prediction, batch, people)
+
+    def panels(self, prediction: FitPrediction, batch: PeopleBatch) -> dict[str, Tensor]:
+        """The first people: their joints, and their bodies from three sides."""
+        rows = [
+            self.portraits.draw(prediction, batch, person) for person in range(min(self.shown, len(prediction.pose)))
+        ]
+        return sheet_of(rows) if rows else {}
 
     def objective(self, prediction: FitPrediction, batch: PeopleBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `Task`: the sum over all fits."""
@@ -206,6 +219,15 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         best = _as_floats(best, torch.float32)
         body = self.body(best.betas, best.pose, best.translation)
         return replace(best, joints=body.joints, verts=body.verts)
+
+    def energies(self, prediction: FitPrediction, batch: PeopleBatch) -> dict[str, tuple[Tensor, float]]:
+        """What each term comes to for each person (B,), without its weight, and the weight of the end."""
+        found = {}
+        for name, term in self._weighted():
+            weight = term.weight_at(_LAST_STEP)
+            rows = term.residual_rows(prediction, batch, _LAST_STEP)
+            found[name] = (rows.square().sum(1) / weight if weight > 0 else rows.new_zeros(len(rows)), weight)
+        return found
 
     def chosen(self, prediction: FitPrediction, people: PeopleBatch, count: int) -> Tensor:
         """The fit (B,) of each of `count` people that counts."""
