@@ -52,9 +52,9 @@ def guarded(main: Callable[[], Any], script: str, config_path: str, config_name:
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # torch's native code warns of what is as it should be
     config_dir = Path(script).resolve().parent / config_path
     try:
-        check_command_line()
-        watch_origins(config_dir)
         with signals.listening():
+            check_command_line()
+            watch_origins(config_dir)
             main()
         if FailureKeeper.failure is not None:
             raise FailureKeeper.failure

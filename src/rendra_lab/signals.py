@@ -44,11 +44,12 @@ def leave_at_once() -> None:
     """From here on a signal ends the program with one line and no more.
 
     Until something is `listening`, and within imports until something has `begun` that would have to be put away.
+    Once nothing is `listening` any more, signals are handled as they were before.
     """
     _watch.in_a_hurry = True
     for number in WATCHED:
-        if signal.getsignal(number) in _OURS_TO_TAKE:
-            signal.signal(number, _leave)
+        if (handler := signal.getsignal(number)) in _OURS_TO_TAKE and handler is not _leave:
+            _watch.at_first[number] = signal.signal(number, _leave)
 
 
 def begun() -> None:
@@ -81,6 +82,7 @@ class _Watch:
     """The state of the one watch of a process."""
 
     def __init__(self) -> None:
+        self.at_first: dict[int, Any] = {}
         self.before: dict[int, Any] = {}
         self.owner = 0
         self.patience = 0
@@ -157,8 +159,8 @@ def listening() -> Iterator[None]:
         yield
     finally:
         for number, handler in _watch.before.items():
-            signal.signal(number, handler)
-        _watch.before = {}
+            signal.signal(number, _watch.at_first.get(number, handler))
+        _watch.before, _watch.at_first, _watch.in_a_hurry = {}, {}, False
 
 
 def take_over() -> None:

@@ -235,6 +235,13 @@ def test_a_program_that_only_loads_leaves_at_once(number: int, listens: bool, tm
     assert process.returncode == 128 + number
 
 
+def test_a_program_leaves_the_handlers_as_it_found_them(train: Callable[..., tuple[int, str, str]]) -> None:
+    before = [signal.getsignal(number) for number in signals.WATCHED]
+    for arguments in (["trainer.max_stes=1"], ["--no-such-flag"]):
+        assert train(*arguments)[0] == 2
+        assert [signal.getsignal(number) for number in signals.WATCHED] == before
+
+
 @pytest.fixture
 def scontrol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A program of that name which writes down how it was called."""
