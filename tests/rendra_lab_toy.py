@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from rendra.renderer.cameras import look_at_rotation
@@ -121,3 +123,10 @@ class SphereViews(SceneViews):
         images = [(ball.observe(caster.blank_view(blank, i)).rgb[0] * 255).round().byte() for i in range(9)]
         views = PosedImages.gather([f"view_{i}.png" for i in range(9)], images, lens, R, T)
         return Scene(views.select(range(6)), views.select([6]), views.select([7, 8]), box)
+
+
+def save_config(cfg: Any) -> None:
+    """What Hydra does before a run."""
+    path = Path(cfg.run_dir) / ".hydra" / "config.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(cfg, path)

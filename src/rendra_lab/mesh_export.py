@@ -21,6 +21,7 @@ from rendra_lab.mesh_extraction import COLORS, extract_mesh, paint_mesh
 from rendra_lab.mesh_quality import components, is_watertight
 from rendra_lab.networks.radiance import RadianceScene
 from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
+from rendra_lab.settings import Count, Fraction, Positive
 from rendra_lab.visualization import Picture, caption, save_picture, tile, to_picture
 
 FORMATS = ("obj", "ply", "glb")
@@ -37,13 +38,13 @@ class SurfaceSettings:
         formats: endings of the files: obj (with its MTL and PNG), ply (colours at vertices), glb.
     """
 
-    resolution: int = 256
-    level: float | None = None
+    resolution: Positive = 256
+    level: Fraction | None = None
     color: str | None = "vertex"
-    keep: float = 0.01
-    smoothing: int = 5
-    num_faces: int | None = None
-    texture_size: int = 1024
+    keep: Fraction = 0.01
+    smoothing: Count = 5
+    num_faces: Positive | None = None
+    texture_size: Positive = 1024
     formats: Sequence[str] = FORMATS
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from rendra_lab_toy import save_config
 
 from rendra_lab import durable
 from rendra_lab.checkpoint_archive import FORMAT, CheckpointError
@@ -31,13 +31,6 @@ def keep(path: Path, step: int, written_at: int = 0, module: str = "here.Pose") 
     )
     os.utime(path, (written_at, written_at))
     return path
-
-
-def save_config(cfg: Any) -> None:
-    """What Hydra does before a run."""
-    path = Path(cfg.run_dir) / ".hydra" / "config.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(cfg, path)
 
 
 def cut_off(path: Path) -> Path:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from assertions import assert_close
 from PIL import Image
-from rendra_lab_toy import SphereTask, SphereViews
+from rendra_lab_toy import SphereTask, SphereViews, save_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rendra_lab import radiance_film
@@ -144,7 +144,9 @@ def test_a_run_ends_with_films_and_views(
     (events,) = finished.glob("events.out.tfevents.*")
     shown = EventAccumulator(str(events))
     shown.Reload()
-    assert {"film/turntable", "film/depth", "film/normals", "test/000/target", "test/001/target"} <= set(shown.Tags()["images"])
+    assert {"film/turntable", "film/depth", "film/normals", "test/000/target", "test/001/target"} <= set(
+        shown.Tags()["images"]
+    )
     assert "film/frames_per_s" in shown.Tags()["scalars"]
     assert shown.Images("film/turntable")[0].encoded_image_string.startswith(b"GIF8")
 
@@ -154,7 +156,7 @@ def test_the_program_films_a_finished_run(
 ) -> None:
     folder = tmp_path / "toy_scene" / "run"
     cfg = compose(folder, "task=toy_scene", "callbacks.turntable=null", "trainer.max_steps=2")
-    save_config(cfg, folder)
+    save_config(cfg)
     run(cfg)
     output = tmp_path / "film.gif"
     code, said, err = program("scripts/render.py", f"run={folder}", "frames=4", "what=rgb", f"output={output}")
@@ -179,7 +181,7 @@ def test_runs_of_other_tasks_are_refused(
 ) -> None:
     folder = tmp_path / "toy" / "run"
     cfg = compose(folder, "task=toy", "debug=fast")
-    save_config(cfg, folder)
+    save_config(cfg)
     run(cfg)
     code, _, err = program("scripts/render.py", f"run={folder}")
     assert code == 2
@@ -199,11 +201,3 @@ def test_a_run_out_of_time_still_ends_with_test_and_films(
     assert (folder / "exports" / "turntable.gif").exists()
     assert (folder / "checkpoints" / "last.ckpt").exists()
     assert f"trainer.max_time ended the fit after step {record['steps']} of 1000000" in capsys.readouterr().out
-
-
-def save_config(cfg: Any, folder: Path) -> None:
-    from omegaconf import OmegaConf
-
-    path = folder / ".hydra" / "config.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(cfg, path)
