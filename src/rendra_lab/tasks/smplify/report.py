@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -67,8 +68,9 @@ class PeopleReport(Callback):
     def _write(self, numbers: Mapping[str, Any]) -> None:
         arrays = {name: value for name, value in numbers.items() if isinstance(value, np.ndarray)}
         names = np.array(numbers["pictures"], dtype=np.str_)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_durably(self.folder / "people.npz", lambda sink: np.savez(sink, pictures=names, **arrays))
+        archive = io.BytesIO()
+        np.savez(archive, pictures=names, **arrays)
+        write_durably(self.folder / "people.npz", lambda sink: sink.write(archive.getvalue()))
         report.write_text(self.folder / "people.json", json.dumps(_plain(numbers), allow_nan=False) + "\n")
 
     def _draw(
