@@ -125,12 +125,13 @@ class LossTerm(_Term):
         """
         positional, keyword = self._arguments(prediction, batch)
         field, *others = positional
-        if hasattr(self.fn, "row_derivatives"):
-            rows = self.fn.row_derivatives(changes, field, *others, **keyword)
+        fn: Any = self.fn
+        if hasattr(fn, "row_derivatives"):
+            rows = fn.row_derivatives(changes, field, *others, **keyword)
         else:
 
             def along(change: Tensor) -> Tensor:
-                return jvp(lambda value: self.fn.residuals(value, *others, **keyword), (field,), (change,))[1]
+                return jvp(lambda value: fn.residuals(value, *others, **keyword), (field,), (change,))[1]
 
             rows = vmap(along, in_dims=-1, out_dims=-1)(changes)
         return self.weight_at(step) ** 0.5 * rows

@@ -14,7 +14,13 @@ _AT_REST = 1e4  # a lambda beyond it moves nothing: begin anew, for the objectiv
 
 @runtime_checkable
 class Problem(Protocol):
-    """N problems of P numbers each."""
+    """N problems of P numbers each.
+
+    Attributes:
+        rows_at_work: those (N,) of all problems, the rows of the solver's parameter, that are still solved.
+    """
+
+    rows_at_work: Tensor
 
     def rows(self, x: Tensor) -> Tensor:
         """Residuals (N, R) at (N, P)."""
@@ -61,10 +67,14 @@ class LeastSquares(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         x = self.param_groups[0]["params"][0]
-        x.copy_(self._moved(x.detach(), self.state[x]))
+        state, rows = self.state[x], self.problem.rows_at_work
+        reach = state.setdefault("reach", x.new_full((len(x),), self.param_groups[0]["reach"]))
+        moved, now = self._moved(x.detach()[rows], reach[rows])
+        x[rows], reach[rows] = moved, now
         return loss
 
-    def _moved(self, x: Tensor, state: dict[str, Any]) -> Tensor:
+    def _moved(self, x: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """States (N, P) after a step, and how far each problem reaches in the next (N,)."""
         raise NotImplementedError
 
 
@@ -82,11 +92,10 @@ class BatchedLevenbergMarquardt(LeastSquares):
     def __init__(self, params: Any, damping: float = 1e-3, tries: int = 3) -> None:
         if not damping > 0 or tries < 1:
             raise ValueError(f"damping must be positive and tries at least 1, got {damping} and {tries}")
-        super().__init__(params, damping=float(damping), tries=int(tries))
+        super().__init__(params, reach=float(damping), tries=int(tries))
 
-    def _moved(self, x: Tensor, state: dict[str, Any]) -> Tensor:
-        group = self.param_groups[0]
-        damping = state.setdefault("damping", x.new_full((len(x),), group["damping"]))
+    def _moved(self, x: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        group, damping = self.param_groups[0], reach
         here = _Normal.of(self.problem, x)
         scale = here.curvature.diagonal(dim1=1, dim2=2).clamp_min(_LEAST_CURVATURE)
         best, cost, moved = x, here.cost, torch.zeros_like(here.cost, dtype=torch.bool)
@@ -99,8 +108,7 @@ class BatchedLevenbergMarquardt(LeastSquares):
             moved = moved | better
             if bool(moved.all()):
                 break
-        state["damping"] = torch.where(damping > _AT_REST, group["damping"], damping)
-        return best
+        return best, torch.where(damping > _AT_REST, group["reach"], damping)
 
 
 class BatchedDogleg(LeastSquares):
@@ -117,11 +125,10 @@ class BatchedDogleg(LeastSquares):
     def __init__(self, params: Any, radius: float = 1.0, tries: int = 4) -> None:
         if not radius > 0 or tries < 1:
             raise ValueError(f"radius must be positive and tries at least 1, got {radius} and {tries}")
-        super().__init__(params, radius=float(radius), tries=int(tries))
+        super().__init__(params, reach=float(radius), tries=int(tries))
 
-    def _moved(self, x: Tensor, state: dict[str, Any]) -> Tensor:
-        group = self.param_groups[0]
-        radius = state.setdefault("radius", x.new_full((len(x),), group["radius"]))
+    def _moved(self, x: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        group, radius = self.param_groups[0], reach
         here = _Normal.of(self.problem, x)
         slope = here.slope[..., 0]
         bend = (slope * (here.curvature @ here.slope)[..., 0]).sum(1).clamp_min(1e-30)
@@ -142,8 +149,7 @@ class BatchedDogleg(LeastSquares):
             moved = moved | better
             if bool(moved.all()):
                 break
-        state["radius"] = radius
-        return best
+        return best, radius
 
 
 def _solve(curvature: Tensor, slope: Tensor) -> Tensor:

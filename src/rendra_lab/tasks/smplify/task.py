@@ -6,6 +6,7 @@ All people of a batch are fitted side by side; one step of the solver is one ste
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -45,6 +46,7 @@ class BodyProblem:
 
     def __init__(self, task: SMPLify, people: PeopleBatch, step: int) -> None:
         self.task, self.people, self.step = task, people, step
+        self.rows_at_work = task.rows_at_work
 
     def rows(self, x: Tensor) -> Tensor:
         """Residuals (N, R) of fits (N, P)."""
@@ -91,6 +93,8 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         flip: also begin from behind where the start leaves it open.
         choose: which of a person's fits counts: that of the least `objective`, or whose joints lie best in the
             `picture`, as Bogo et al. choose between the two sides.
+        narrow: pairs [step, count]: from that step on, so many fits of each person are gone on with, the best by the
+            weights of the end.
         shown: people in the panels, from the first on.
         **parts: losses, metrics, optimizer, scheduler of `Task`.
 
@@ -100,6 +104,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
 
     person: Tensor  # (N,) whose fit each row is
     is_flipped: Tensor  # (N,)
+    is_at_work: Tensor  # (N,) False for a fit that was given up for a better one of the same person
 
     def __init__(
         self,
@@ -108,6 +113,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         poses: PosePrior | None = None,
         flip: bool = True,
         choose: str = "objective",
+        narrow: Sequence[Sequence[int]] = (),
         shown: Count = 4,
         **parts: Any,
     ) -> None:
@@ -125,6 +131,9 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         self.poses = poses
         self.flip = flip
         self.choose = choose
+        self.narrow = {int(step): int(count) for step, count in narrow}
+        if any(count < 1 for count in self.narrow.values()):
+            raise UserError(f"module.narrow keeps at least one fit of everyone, got {dict(self.narrow)}")
         self.shown = shown
         self.portraits = Portraits(body.faces, size=192)
         self.spheres = BodySpheres(body)
@@ -133,6 +142,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         self.x = nn.Parameter(torch.zeros(1, 3 * body.num_joints + body.num_betas + 3, dtype=torch.float64))
         self.register_buffer("person", torch.zeros(1, dtype=torch.int64))
         self.register_buffer("is_flipped", torch.zeros(1, dtype=torch.bool))
+        self.register_buffer("is_at_work", torch.ones(1, dtype=torch.bool))
         self._batches: tuple[PeopleBatch, PeopleBatch] | None = None
 
     def setup(self, stage: str) -> None:
@@ -151,6 +161,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         means = rest.new_zeros(1, 3 * self.body.num_joints - 3) if self.poses is None else self.poses.means
         self.person = person.repeat(len(means))
         self.is_flipped = (torch.arange(len(person), device=heading.device) >= len(place)).repeat(len(means))
+        self.is_at_work = torch.ones_like(self.is_flipped)
         x = self.x.new_zeros(len(self.person), self.x.shape[1])
         x[:, :3] = heading.repeat(len(means), 1)
         x[:, 3 : 3 * self.body.num_joints] = means.repeat_interleave(len(person), 0)
@@ -159,9 +170,9 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
 
     def predict(self, batch: PeopleBatch) -> FitPrediction:
         """All fits while they are made; then each person's best one, with its surface."""
-        points = self.markers(self.x).points
+        x = self.x.index_select(0, self.rows_at_work)
         people = self.fits(batch)
-        prediction = self.prediction_of(points, self.x, people)
+        prediction = self.prediction_of(self.markers(x).points, x, people)
         return prediction if self.training else self._best(prediction, batch, people)
 
     def panels(self, prediction: FitPrediction, batch: PeopleBatch) -> dict[str, Tensor]:
@@ -179,12 +190,30 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         """What a solver is given before every step."""
         return BodyProblem(self, self.fits(batch), step)
 
+    @property
+    def rows_at_work(self) -> Tensor:
+        """The fits (n,) that are gone on with; all others have been given up."""
+        return self.is_at_work.nonzero()[:, 0]
+
     def fits(self, batch: PeopleBatch) -> PeopleBatch:
-        """The people of a batch, one for each fit."""
-        if self._batches is None or self._batches[0] is not batch:
-            people = replace(batch, truth=None).select(self.person)  # which no term knows
+        """The people of a batch, one for each fit at work."""
+        person = self.person[self.rows_at_work]
+        if self._batches is None or self._batches[0] is not batch or len(self._batches[1].joints_px) != len(person):
+            people = replace(batch, truth=None).select(person)  # no term knows the truth
             self._batches = batch, _as_floats(people, torch.float64)
         return self._batches[1]
+
+    @torch.no_grad()
+    def give_up(self, batch: PeopleBatch, count: int) -> None:
+        """Go on with the best `count` fits of each person."""
+        rows, people = self.rows_at_work, self.fits(batch)
+        x = self.x.index_select(0, rows)
+        cost = self._costs(self.prediction_of(self.markers(x).points, x, people), people)
+        order = torch.argsort(cost, stable=True)
+        order = order[torch.argsort(self.person[rows][order], stable=True)]  # by person, then by cost
+        person = self.person[rows][order]
+        rank = torch.arange(len(person), device=person.device) - torch.searchsorted(person, person)
+        self.is_at_work[rows[order[rank >= count]]] = False
 
     def terms(self) -> list[LossTerm]:
         """Those of the objective."""
@@ -201,13 +230,15 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
             translation=x[:, -3:],
             joints_px=project(joints, people.focal_px, people.center_px),
             spheres=self.spheres.balls(middles, betas),
-            person=self.person,
-            is_flipped=self.is_flipped,
+            person=self.person[self.rows_at_work],
+            is_flipped=self.is_flipped[self.rows_at_work],
         )
 
     def on_train_batch_start(self, batch: PeopleBatch, batch_idx: int) -> None:
         """Lightning's hook: hands the problem to the solver."""
         super().on_train_batch_start(batch, batch_idx)
+        if self.global_step in self.narrow:
+            self.give_up(batch, self.narrow[self.global_step])
         for optimizer in self.trainer.optimizers:
             if getattr(optimizer, "needs_problem", False):
                 optimizer.problem = self.problem(batch, self.global_step)  # type: ignore[attr-defined]
@@ -231,17 +262,22 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
 
     def chosen(self, prediction: FitPrediction, people: PeopleBatch, count: int) -> Tensor:
         """The fit (B,) of each of `count` people that counts."""
+        cost, person = self._costs(prediction, people), prediction.person
+        least = cost.new_full((count,), torch.inf).scatter_reduce(0, person, cost, "amin")
+        order = torch.arange(len(cost), device=cost.device)
+        first = torch.where(cost <= least[person], order, len(cost))
+        return first.new_full((count,), len(cost)).scatter_reduce(0, person, first, "amin")
+
+    def _costs(self, prediction: FitPrediction, people: PeopleBatch) -> Tensor:
+        """What fits (N,) are compared by."""
         terms = [term for term in self.terms() if self.choose == "objective" or term.prediction == "joints_px"]
         rows = [term.residual_rows(prediction, people, _LAST_STEP).square().sum(1) for term in terms]
-        cost = torch.stack(rows).sum(0) if rows else self.x.new_zeros(len(self.person))
-        least = cost.new_full((count,), torch.inf).scatter_reduce(0, self.person, cost, "amin")
-        order = torch.arange(len(cost), device=cost.device)
-        first = torch.where(cost <= least[self.person], order, len(cost))
-        return first.new_full((count,), len(cost)).scatter_reduce(0, self.person, first, "amin")
+        return torch.stack(rows).sum(0) if rows else self.x.new_zeros(len(prediction.person))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Torch's hook: takes on the number of fits that a checkpoint has."""
         named = [("x", self.x), ("person", self.person), ("is_flipped", self.is_flipped)]
+        named += [("is_at_work", self.is_at_work)]
         take_sizes(cast(Any, named), state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
