@@ -135,7 +135,7 @@ class SMPLify(Task[PeopleBatch, FitPrediction]):
         if any(count < 1 for count in self.narrow.values()):
             raise UserError(f"module.narrow keeps at least one fit of everyone, got {dict(self.narrow)}")
         self.shown = shown
-        self.portraits = Portraits(body.faces, size=192)
+        self.portraits = Portraits(body.faces, size=160)
         self.spheres = BodySpheres(body)
         markers = [*picture_markers(body), *self.spheres.markers]
         self.markers = MarkerSet(body, markers).double()  # objectives that differ in their ninth digit only
