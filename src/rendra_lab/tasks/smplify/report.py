@@ -69,7 +69,7 @@ class PeopleReport(Callback):
         arrays = {name: value for name, value in numbers.items() if isinstance(value, np.ndarray)}
         names = np.array(numbers["pictures"], dtype=np.str_)
         archive = io.BytesIO()
-        np.savez(archive, pictures=names, **arrays)
+        np.savez(archive, pictures=names, **arrays)  # type: ignore[arg-type]
         write_durably(self.folder / "people.npz", lambda sink: sink.write(archive.getvalue()))
         report.write_text(self.folder / "people.json", json.dumps(_plain(numbers), allow_nan=False) + "\n")
 
