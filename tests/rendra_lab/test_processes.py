@@ -108,6 +108,9 @@ def test_a_share_outside_a_run_is_all() -> None:
 
 def test_several_machines_are_composed(compose: Compose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lightning.pytorch.plugins.environments import TorchElasticEnvironment
+    from lightning.pytorch.utilities import rank_zero_only
+
+    monkeypatch.setattr(rank_zero_only, "rank", 0)  # for all of this process; a trainer changes it
 
     variables = {"WORLD_SIZE": "8", "RANK": "5", "LOCAL_RANK": "1", "GROUP_RANK": "2", "LOCAL_WORLD_SIZE": "2",
                  "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500", "TORCHELASTIC_RUN_ID": "fit7"}  # fmt: skip
