@@ -354,9 +354,9 @@ def _optimized(record: Mapping[str, Any]) -> float | None:
 
 
 def _parts(group: DictConfig | None) -> list[Any]:
-    """The parts of a group by name, without those switched off by null."""
-    built = instantiate(group, _convert_="all") if group else {}
-    return [part for part in built.values() if part is not None]
+    """The parts of a group by name, without those switched off by null, or left out: nothing says what they are."""
+    named = [part for part in (group or {}).values() if part is not None and "_target_" in part]
+    return [instantiate(part, _convert_="all") for part in named]
 
 
 def _plugins(trainer: DictConfig) -> list[Any]:

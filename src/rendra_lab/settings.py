@@ -106,7 +106,7 @@ def check_run(tree: Mapping[str, Any]) -> None:
         if not isinstance(members, Mapping):
             raise UserError(f"{group} must be one of its choices or a list of them, got {_shown(members)}")
         for name, member in members.items():
-            if member is not None and not _is_object(member):
+            if member is not None and not isinstance(member, Mapping):  # without _target_: left out
                 raise UserError(f"{group}.{name} must be null or have a _target_, got {_shown(member)}")
 
 

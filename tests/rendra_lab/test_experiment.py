@@ -192,7 +192,7 @@ def test_the_best_weights_can_be_tested(compose: Compose, tmp_path: Path) -> Non
 
 def test_parts_can_be_switched_off(compose: Compose, tmp_path: Path) -> None:
     folder = tmp_path / "toy" / "run"
-    off = ["logger=csv", "callbacks=[timer]", "test=null", "optimized_metric=null"]
+    off = ["logger=csv", "callbacks=[timer]", "test=null", "optimized_metric=null", "+callbacks.images.max_files=3"]
     assert run(compose(folder, "task=toy", "debug=fast", *off)) is None
     names = {path.name for path in folder.rglob("*")}
     assert names == {"metrics.json", "metrics.csv", "report.html"}
