@@ -52,6 +52,7 @@ def placed(experiment: Experiment, steps: int = 0) -> tuple[SMPLify, PeopleBatch
 def test_a_run_leaves_bodies_that_meet_their_joints(compose: Callable[..., Any], tmp_path: Path) -> None:
     folder = tmp_path / "smplify" / "run"
     settings = ("callbacks.people.pictures=2", "callbacks.people.meshes=1", "callbacks.people.size=48")
+    settings += ("callbacks.animation.every_n_steps=12", "callbacks.images.every_n_steps=0")
     run(compose(folder, "task=smplify", *CLEAN, "data.image_size=256", "module.shown=1", *settings))
     record = json.loads((folder / "metrics.json").read_text())
     assert record["metrics"]["test/joints_px"] < 3
