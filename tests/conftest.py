@@ -1,6 +1,7 @@
 """Fixtures that every test may use."""
 
 import os
+import signal
 from pathlib import Path
 
 # Tests run side by side: threads that wait must sleep, or they take the cores from those that work.
@@ -8,6 +9,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import pytest
 import torch
+
+# A shell that starts the tests in the background lets them, and every program they start, ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The real inputs lie beside the project, never in it: a user has no such folder, and then these tests skip.
 SHARED_DATA = Path(os.environ.get("RENDRA_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
