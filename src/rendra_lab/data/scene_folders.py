@@ -10,7 +10,7 @@ import json
 import math
 import shutil
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +68,29 @@ def check_output(folder: str | Path, format: str, overwrite: bool = False) -> No
     """
     if format not in _WRITERS:
         raise UserError(f"format must be one of {', '.join(_WRITERS)}, got {format!r}")
-    folder = Path(folder)
+    check_folder(Path(folder), _OURS, "no scene has", overwrite)
+
+
+def check_folder(folder: Path, ours: Collection[str], foreign_words: str, overwrite: bool) -> None:
+    """Refuse to write into a folder that holds anything, or, to overwrite it, anything that is not ours.
+
+    Args:
+        folder: that may not be there yet.
+        ours: names of the files and folders that are written.
+        foreign_words: what is said of another one after "which".
+        overwrite: whether ours may go.
+
+    Raises:
+        UserError: so, or the folder is a file.
+    """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"output={folder} is a file; a folder is written")
     present = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     if present and not overwrite:
         raise UserError(f"output={folder} is not empty: choose another folder, or overwrite=true")
-    foreign = [name for name in present if name not in _OURS]
+    foreign = [name for name in present if name not in ours]
     if foreign:
-        raise UserError(f"output={folder} holds {foreign[0]!r}, which no scene has: it is not overwritten")
+        raise UserError(f"output={folder} holds {foreign[0]!r}, which {foreign_words}: it is not overwritten")
 
 
 def camera_to_world(images: PosedImages) -> Tensor:

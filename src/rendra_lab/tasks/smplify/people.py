@@ -18,6 +18,7 @@ from torch import Tensor
 
 from rendra.body import SMPL
 from rendra_lab.data.kept_tensors import kept_or_made
+from rendra_lab.data.scene_folders import check_folder
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Fraction, Positive, check_numbers
 from rendra_lab.synthesis.people import Crowd, Painter, draw_crowd
@@ -125,7 +126,7 @@ class GeneratedPeople(PeopleData):
             UserError: it is there already, and something else than such a folder or not to be replaced.
         """
         folder = Path(folder).absolute()
-        _check_output(folder, overwrite)
+        check_folder(folder, _OURS, "is none of these files", overwrite)
         self.setup("fit")
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.partial")
@@ -208,17 +209,6 @@ def detected(
     joints_px += noise_px * effort[..., None] * noise
     lost = torch.rand(confidence.shape, generator=generator) < missing
     return joints_px.masked_fill(lost[..., None], 0), confidence.masked_fill(lost, 0)
-
-
-def _check_output(folder: Path, overwrite: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"output={folder} is a file; a folder is written")
-    present = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
-    if present and not overwrite:
-        raise UserError(f"output={folder} is not empty: choose another folder, or overwrite=true")
-    foreign = [name for name in present if name not in _OURS]
-    if foreign:
-        raise UserError(f"output={folder} holds {foreign[0]!r}, which is none of these files: it is not overwritten")
 
 
 def _version(package: str) -> str:
