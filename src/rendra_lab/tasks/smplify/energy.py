@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from rendra.body import SMPL_JOINTS
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
-from rendra_lab.tasks.smplify.records import COUNTED
 
 
 class SumOfSquares(nn.Module):
@@ -35,43 +34,49 @@ class Reprojection(SumOfSquares):
 
     Args:
         scale_px: s.
-        joint_weights: of each joint of the picture; None: 1 for those that count (`COUNTED`), 0 for the others.
     """
 
-    weights: Tensor
-
-    def __init__(self, scale_px: float = 100.0, joint_weights: tuple[float, ...] | None = None) -> None:
+    def __init__(self, scale_px: float = 100.0) -> None:
         super().__init__()
         if not scale_px > 0:
             raise ValueError(f"scale_px must be positive, got {scale_px}")
         self.scale_px = scale_px
-        self.register_buffer("weights", torch.tensor(joint_weights or COUNTED, dtype=torch.float32), False)
 
-    def residuals(self, joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, enlarge: Tensor) -> Tensor:
+    def residuals(
+        self, joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, weight: Tensor, enlarge: Tensor
+    ) -> Tensor:
         """Rows (N, 2 K).
 
         Args:
             joints_px: (N, K, 2) projected.
             target_px: (N, K, 2) of the picture.
             confidence: (N, K) in [0, 1]; 0 for a joint that was not found.
+            weight: (N, K) that multiplies it.
             enlarge: (N,) pixels of the paper's picture in one of this.
         """
         error = (joints_px - target_px) * enlarge[:, None, None]
         robust = error * self.scale_px / (self.scale_px**2 + error.square()).sqrt()
-        return self._weighted(robust, confidence).flatten(1)
+        return _weighted(robust, weight * confidence).flatten(1)
 
     def row_derivatives(
-        self, changes: Tensor, joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, enlarge: Tensor
+        self,
+        changes: Tensor,
+        joints_px: Tensor,
+        target_px: Tensor,
+        *,
+        confidence: Tensor,
+        weight: Tensor,
+        enlarge: Tensor,
     ) -> Tensor:
         """How the rows change with joints_px: (N, 2 K, P) of changes (N, K, 2, P)."""
         error = (joints_px - target_px) * enlarge[:, None, None]
         slope = self.scale_px**3 / (self.scale_px**2 + error.square()).pow(1.5) * enlarge[:, None, None]
-        return (self._weighted(slope, confidence)[..., None] * changes).flatten(1, 2)
+        return (_weighted(slope, weight * confidence)[..., None] * changes).flatten(1, 2)
 
-    def _weighted(self, rows: Tensor, confidence: Tensor) -> Tensor:
-        """Joints (N, K, 2) that nobody found count nothing, whatever stands there."""
-        weight = (self.weights * confidence)[..., None]
-        return torch.where(weight > 0, weight * rows, 0.0)
+
+def _weighted(rows: Tensor, weight: Tensor) -> Tensor:
+    """Joints (N, K, 2) by weights (N, K); those that nobody found count nothing, whatever stands there."""
+    return torch.where(weight[..., None] > 0, weight[..., None] * rows, 0.0)
 
 
 class NaturalPose(SumOfSquares):

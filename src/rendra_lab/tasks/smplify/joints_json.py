@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,9 +32,7 @@ class JointsJSON(PicturePeople):
         size: height and width of pictures that are not there and of which the file says nothing.
         focal_px: in the picture's pixels; None: the picture's diagonal.
         least_confidence: joints below it count as not found. MediaPipe gives all joints some place.
-        first: the first person taken, counted from 0.
-        count: how many people; None for all that follow.
-        steps: optimisation steps an epoch.
+        **people: `first`, `count`, `hips_and_neck` and `steps` of `PicturePeople`.
     """
 
     def __init__(
@@ -44,11 +43,9 @@ class JointsJSON(PicturePeople):
         size: Sequence[int] | None = None,
         focal_px: float | None = None,
         least_confidence: float = 0.1,
-        first: int = 0,
-        count: int | None = None,
-        steps: int = 10_000,
+        **people: Any,
     ) -> None:
-        super().__init__(focal_px, first, count, steps)
+        super().__init__(focal_px, **people)
         if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size)):
             raise UserError(f"data.size must be [height,width] in whole pixels, got {size!r}")
         if not 0 <= least_confidence <= 1:

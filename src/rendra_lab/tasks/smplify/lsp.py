@@ -58,9 +58,7 @@ class LSP(PicturePeople):
             seen in files (14, 3, N), the extended set's; in files (3, 14, N) what leaves more joints seen, since the
             set's notes say the one and its file the other.
         focal_px: in the picture's pixels: 5000 of the paper's, which enlarges pictures twice.
-        first: the first person taken, counted from 0.
-        count: how many people; None for all that follow.
-        steps: optimisation steps an epoch.
+        **people: `first`, `count`, `hips_and_neck` and `steps` of `PicturePeople`.
     """
 
     def __init__(
@@ -69,11 +67,9 @@ class LSP(PicturePeople):
         joints: str | None = None,
         flags: str = "auto",
         focal_px: float = 2500.0,
-        first: int = 0,
-        count: int | None = None,
-        steps: int = 10_000,
+        **people: Any,
     ) -> None:
-        super().__init__(focal_px, first, count, steps)
+        super().__init__(focal_px, **people)
         if joints is not None and joints not in _FILES:
             raise UserError(f"data.joints is one of {' '.join(_FILES)}, or null; got {joints!r}")
         if flags not in _FLAGS:

@@ -24,7 +24,7 @@ from rendra_lab.settings import Fraction, Positive, check_numbers
 from rendra_lab.synthesis.people import Crowd, Painter, draw_crowd
 from rendra_lab.tasks.smplify.markers import MarkerSet
 from rendra_lab.tasks.smplify.people_data import PeopleData, Picture
-from rendra_lab.tasks.smplify.records import LSP_JOINTS, BodyTruth, PeopleBatch
+from rendra_lab.tasks.smplify.records import LSP_JOINTS, BodyTruth, PeopleBatch, joint_weights
 from rendra_lab.tasks.smplify.task import picture_markers, project
 
 _EDITION = "1"  # of the pictures; another one makes all cached ones anew
@@ -100,6 +100,7 @@ class GeneratedPeople(PeopleData):
             size_px=torch.tensor(self.size).float().expand(self.count, 2).clone(),
             focal_px=crowd.focal_px,
             center_px=crowd.center_px.clone(),
+            weight=joint_weights(self.count, hips_and_neck=1.0),  # the body's own joints
             pictures=tuple(f"person_{index:04d}" for index in range(self.count)),
             truth=BodyTruth(
                 crowd.pose.flatten(1), crowd.betas, crowd.translation, crowd.joints, crowd.verts, clean_px

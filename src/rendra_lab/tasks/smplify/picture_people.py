@@ -12,10 +12,11 @@ import numpy as np
 import torch
 
 from rendra_lab.errors import UserError
+from rendra_lab.settings import Fraction, check_numbers
 from rendra_lab.tasks.smplify.joint_layouts import Joints
 from rendra_lab.tasks.smplify.people_data import PeopleData, Picture
 from rendra_lab.tasks.smplify.picture_files import read_upright
-from rendra_lab.tasks.smplify.records import LSP_JOINTS, PeopleBatch
+from rendra_lab.tasks.smplify.records import LSP_JOINTS, PeopleBatch, joint_weights
 
 MOST_PEOPLE = 100_000
 
@@ -39,14 +40,23 @@ class PicturePeople(PeopleData):
             photographs of unknown cameras: 53 degrees from corner to corner.
         first: the first person taken, counted from 0.
         count: how many people; None for all that follow.
+        hips_and_neck: what these joints count, 1 as the others do; 0: not at all, as in the code of Bogo et al.
         steps: optimisation steps an epoch.
 
     Raises:
         UserError: a focal length that is not positive, or a negative number of people.
     """
 
-    def __init__(self, focal_px: float | None, first: int = 0, count: int | None = None, steps: int = 10_000) -> None:
+    def __init__(
+        self,
+        focal_px: float | None,
+        first: int = 0,
+        count: int | None = None,
+        hips_and_neck: float = 0.0,
+        steps: int = 10_000,
+    ) -> None:
         super().__init__(steps)
+        check_numbers("data", Fraction, hips_and_neck=hips_and_neck)
         if focal_px is not None and not (focal_px > 0 and math.isfinite(focal_px)):
             raise UserError(f"data.focal_px must be a number of pixels above zero, got {focal_px!r}")
         if first < 0:
@@ -56,6 +66,7 @@ class PicturePeople(PeopleData):
         self.focal_px = focal_px
         self.first = first
         self.count = count
+        self.hips_and_neck = hips_and_neck
 
     @abstractmethod
     def read(self) -> list[GivenPerson]:
@@ -97,6 +108,7 @@ class PicturePeople(PeopleData):
             size_px=size,
             focal_px=focal,
             center_px=size.flip(1) / 2,
+            weight=joint_weights(len(people), self.hips_and_neck),
             pictures=tuple(person.picture for person in people),
         )
 

@@ -24,9 +24,7 @@ LSP_JOINTS = (
     "right_shoulder", "left_shoulder", "left_elbow", "left_wrist", "neck", "head_top",
 )  # fmt: skip
 
-
-COUNTED = tuple(name not in ("right_hip", "left_hip", "neck") for name in LSP_JOINTS)
-"""Joints that count: where people and bodies have their hips and neck differs by convention."""
+_HIPS_AND_NECK = tuple(LSP_JOINTS.index(name) for name in ("right_hip", "left_hip", "neck"))
 
 USUAL_HEIGHT_PX = 300.0
 """Of a person in the pictures that the weights of Bogo et al. were chosen for: LSP's, enlarged twice."""
@@ -53,9 +51,15 @@ class PeopleBatch(TensorRecord):
     size_px: Float[Tensor, "B 2"]  # height and width of the picture
     focal_px: Float[Tensor, " B"]
     center_px: Float[Tensor, "B 2"]  # principal point, x and y
+    weight: Float[Tensor, "B K"]  # of each joint, found or not; 0 where people mean another place than bodies have
     pictures: tuple[str, ...]  # what each picture is called: a path, or a name where there is none
     truth: BodyTruth | None = None
     picture_of: Callable[[int], Any] | None = None  # (H, W, 3) uint8, or None: read when asked for
+
+    @property
+    def counted(self) -> Float[Tensor, "B K"]:
+        """Weight of each joint: 0 for those that were not found, whatever stands there."""
+        return self.weight * (self.confidence > 0)
 
     @property
     def height_px(self) -> Float[Tensor, " B"]:
@@ -73,6 +77,16 @@ class PeopleBatch(TensorRecord):
     def select(self, rows: Tensor) -> PeopleBatch:
         """The people of rows (N,), some perhaps twice."""
         return self._map(lambda value: value.index_select(0, rows), lambda value: isinstance(value, Tensor))
+
+
+def joint_weights(people: int, hips_and_neck: float) -> Tensor:
+    """Weights (people, 14) of LSP's joints: 1, and another for hips and neck.
+
+    People mark hips and neck elsewhere than bodies have these joints: Bogo et al. leave them out.
+    """
+    weights = torch.ones(people, len(LSP_JOINTS))
+    weights[:, _HIPS_AND_NECK] = hips_and_neck
+    return weights
 
 
 @dataclass(frozen=True)

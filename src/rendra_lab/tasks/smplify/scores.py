@@ -13,7 +13,7 @@ from torch import Tensor
 from rendra.body import SMPL, SMPL_JOINTS
 from rendra_lab.synthesis.joint_limits import beyond_limits, joint_angles
 from rendra_lab.tasks.smplify.body_spheres import Balls, limbs_inside_trunk
-from rendra_lab.tasks.smplify.records import COUNTED, BodyTruth
+from rendra_lab.tasks.smplify.records import BodyTruth
 
 _CONFIDENT = 0.5
 _TOLERANCE_DEG = 10.0  # people differ
@@ -26,20 +26,22 @@ _BACKWARDS = tuple(
 """Elbows and knees: the angle that grows, or falls, as they are bent the wrong way."""
 
 
-def joint_error_px(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor) -> Tensor:
-    """Mean distance (pixels) of the joints that count and were found, from where they were found."""
-    return _mean_of(joints_px, target_px, confidence > 0)
+def joint_error_px(joints_px: Tensor, target_px: Tensor, *, counted: Tensor) -> Tensor:
+    """Mean distance (pixels) of the joints that were found and count (above 0), from where they were found."""
+    return _mean_of(joints_px, target_px, counted > 0)
 
 
-def joint_error_percent(joints_px: Tensor, target_px: Tensor, *, confidence: Tensor, height_px: Tensor) -> Tensor:
+def joint_error_percent(
+    joints_px: Tensor, target_px: Tensor, *, counted: Tensor, confidence: Tensor, height_px: Tensor
+) -> Tensor:
     """The same in percent of the person's size, of the confident joints alone (confidence of 0.5 and more)."""
     scale = 100 / height_px[:, None, None]
-    return _mean_of(joints_px * scale, target_px * scale, confidence >= _CONFIDENT)
+    return _mean_of(joints_px * scale, target_px * scale, (counted > 0) & (confidence >= _CONFIDENT))
 
 
 def clean_error_px(joints_px: Tensor, truth: BodyTruth) -> Tensor:
-    """Mean distance (pixels) of the joints that count from the true ones."""
-    return _mean_of(joints_px, truth.clean_px, torch.ones_like(joints_px[..., 0], dtype=torch.bool))
+    """Mean distance (pixels) of all joints from the true ones."""
+    return (joints_px - truth.clean_px).norm(dim=-1).mean()
 
 
 def mpjpe_mm(joints: Tensor, truth: BodyTruth) -> Tensor:
@@ -117,7 +119,6 @@ def _about_root(joints: Tensor) -> Tensor:
     return joints - joints[:, :1]
 
 
-def _mean_of(joints: Tensor, target: Tensor, found: Tensor) -> Tensor:
-    counts = found & torch.tensor(COUNTED, device=found.device)
-    distance = torch.where(counts, (joints - target).norm(dim=-1), 0.0)
-    return distance.sum() / counts.sum().clamp_min(1)
+def _mean_of(joints: Tensor, target: Tensor, counted: Tensor) -> Tensor:
+    distance = torch.where(counted, (joints - target).norm(dim=-1), 0.0)
+    return distance.sum() / counted.sum().clamp_min(1)

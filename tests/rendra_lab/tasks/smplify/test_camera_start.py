@@ -29,7 +29,8 @@ def seen(rest: Tensor, turns: Tensor, place: Tensor) -> PeopleBatch:
     focal, center = torch.full((count,), _FOCAL), torch.full((count, 2), 128.0)
     joints_px = project(rest @ turns.transpose(1, 2) + place[:, None], focal, center)
     names = tuple(str(index) for index in range(count))
-    return PeopleBatch(joints_px, torch.ones(count, 14), torch.full((count, 2), 256.0), focal, center, names)
+    ones, size = torch.ones(count, 14), torch.full((count, 2), 256.0)
+    return PeopleBatch(joints_px, ones, size, focal, center, ones, names)
 
 
 def without(batch: PeopleBatch, *names: str) -> PeopleBatch:

@@ -10,6 +10,7 @@ from torch import Tensor
 from rendra.body import SMPL_JOINTS
 from rendra_lab.tasks.smplify.energy import NaturalBends, NaturalPose, Reprojection, UsualShape
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
+from rendra_lab.tasks.smplify.records import joint_weights
 from rendra_lab.terms import LossTerm
 
 
@@ -33,7 +34,9 @@ def check_derivatives(term: Any, field: Tensor, *others: Tensor, **named: Tensor
 def seen(count: int = 3) -> dict[str, Tensor]:
     confidence = near_one(1, count, 14).abs().clamp_max(1)
     confidence[0, 4] = 0
-    return {"confidence": confidence, "enlarge": near_one(2, count).abs() + 0.5}
+    weight = near_one(8, count, 14).abs()
+    weight[1, 2] = 0
+    return {"confidence": confidence, "weight": weight, "enlarge": near_one(2, count).abs() + 0.5}
 
 
 def test_written_derivatives_are_autograds() -> None:
@@ -45,7 +48,8 @@ def test_written_derivatives_are_autograds() -> None:
 
 def test_small_errors_count_as_they_are_and_large_ones_no_more_than_the_scale() -> None:
     one = torch.ones(1, 14, dtype=torch.float64)
-    named = {"confidence": one, "enlarge": torch.ones(1, dtype=torch.float64)}
+    weight = joint_weights(1, hips_and_neck=0.0).double()
+    named = {"confidence": one, "weight": weight, "enlarge": torch.ones(1, dtype=torch.float64)}
     target = torch.zeros(1, 14, 2, dtype=torch.float64)
     term = Reprojection(100.0).double()
     small = term.residuals(target + 0.1, target, **named)
@@ -62,24 +66,27 @@ def test_small_errors_count_as_they_are_and_large_ones_no_more_than_the_scale() 
 def test_errors_are_those_of_the_papers_pictures() -> None:
     """A person of half the size counts as one of the full size with twice the error."""
     term, target = Reprojection(), torch.zeros(1, 14, 2)
-    confidence = torch.ones(1, 14)
-    small = term(target + 2, target, confidence=confidence, enlarge=torch.tensor([2.0]))
-    large = term(target + 4, target, confidence=confidence, enlarge=torch.tensor([1.0]))
+    sure = {"confidence": torch.ones(1, 14), "weight": torch.ones(1, 14)}
+    small = term(target + 2, target, **sure, enlarge=torch.tensor([2.0]))
+    large = term(target + 4, target, **sure, enlarge=torch.tensor([1.0]))
     assert float(small) == pytest.approx(float(large))
 
 
 def test_joints_that_nobody_found_count_nothing_whatever_stands_there() -> None:
     target, joints_px = torch.full((1, 14, 2), torch.nan), torch.zeros(1, 14, 2)
-    value = Reprojection()(joints_px, target, confidence=torch.zeros(1, 14), enlarge=torch.ones(1))
+    unseen = {"confidence": torch.zeros(1, 14), "weight": torch.ones(1, 14)}
+    value = Reprojection()(joints_px, target, **unseen, enlarge=torch.ones(1))
     assert float(value) == 0
 
 
 def test_joints_count_as_they_are_told_to() -> None:
-    term = Reprojection(1e9, joint_weights=(0.0,) * 13 + (3.0,))
-    rows = term.residuals(
-        torch.ones(1, 14, 2), torch.zeros(1, 14, 2), confidence=torch.full((1, 14), 0.5), enlarge=torch.ones(1)
-    )
+    joints_px, weight = torch.ones(1, 14, 2), torch.tensor([[0.0] * 13 + [3.0]])
+    known = {"confidence": torch.full((1, 14), 0.5), "weight": weight, "enlarge": torch.ones(1)}
+    rows = Reprojection(1e9).residuals(joints_px, 0 * joints_px, **known)
     assert rows[0].tolist() == [0.0] * 26 + [1.5] * 2
+
+
+def test_the_scale_of_errors_is_positive() -> None:
     with pytest.raises(ValueError, match="scale_px must be positive, got 0"):
         Reprojection(0.0)
 

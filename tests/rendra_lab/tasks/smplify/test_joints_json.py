@@ -20,6 +20,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.tasks.smplify.joint_layouts import LAYOUTS
 from rendra_lab.tasks.smplify.joints_json import JointsJSON
 from rendra_lab.tasks.smplify.lsp import LSP
+from rendra_lab.tasks.smplify.picture_people import PicturePeople
 from rendra_lab.tasks.smplify.records import LSP_JOINTS
 
 SIZE = (120, 90)  # height, width
@@ -372,7 +373,8 @@ def test_configurations_say_the_defaults(of: type) -> None:
     file = Path(__file__).parents[4] / "conf" / "data" / f"{module.rpartition('.')[2]}.yaml"
     settings = OmegaConf.to_container(OmegaConf.load(file).data)
     assert settings.pop("_target_") == f"{module}.{of.__name__}"
-    defaults = {name: each.default for name, each in inspect.signature(of).parameters.items() if name != "steps"}
+    takes = {**inspect.signature(PicturePeople).parameters, **inspect.signature(of).parameters}
+    defaults = {name: each.default for name, each in takes.items() if name not in ("steps", "people")}
     defaults["path"] = "???"
     assert settings == defaults
 

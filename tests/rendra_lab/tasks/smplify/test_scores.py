@@ -8,7 +8,7 @@ import torch
 from rendra.body import SMPL, SMPL_JOINTS
 from rendra.transforms import axis_angle_to_matrix
 from rendra_lab.tasks.smplify import scores
-from rendra_lab.tasks.smplify.records import BodyTruth
+from rendra_lab.tasks.smplify.records import BodyTruth, joint_weights
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +76,14 @@ def test_errors_in_the_picture_are_of_joints_that_count_and_were_found() -> None
     confidence[0, 0] = 0.0
     confidence[1, 1] = 0.4
     fitted[1, 1] = torch.tensor([25.0, 0.0])
-    found = scores.joint_error_px(fitted, target, confidence=confidence)
+    counted = joint_weights(2, hips_and_neck=0.0) * (confidence > 0)
+    found = scores.joint_error_px(fitted, target, counted=counted)
     assert float(found) == pytest.approx((20 * 3 + 25) / 21)
     percent = scores.joint_error_percent(
-        fitted, target, confidence=confidence, height_px=torch.tensor([100.0, 200.0])
+        fitted, target, counted=counted, confidence=confidence, height_px=torch.tensor([100.0, 200.0])
     )
     assert float(percent) == pytest.approx((10 * 3 + 10 * 1.5) / 20)
-    assert float(scores.joint_error_px(fitted, target, confidence=0 * confidence)) == 0
+    assert float(scores.joint_error_px(fitted, target, counted=0 * counted)) == 0
 
 
 def test_shapes_are_compared_at_rest_pelvis_on_pelvis(body: SMPL) -> None:
