@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from rendra.body import SMPL_JOINTS
+from rendra_lab.synthesis.joint_limits import beyond_limits
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
 
 
@@ -121,6 +122,22 @@ class NaturalBends(SumOfSquares):
         """How the rows change with the pose: (N, 4, P) of changes (N, 3 J, P)."""
         slope = self.steepness * self.signs * self.residuals(pose)
         return slope[..., None] * changes.index_select(1, self.columns)
+
+
+class JointLimits(SumOfSquares):
+    """No joint turns further than joints do: see `rendra_lab.synthesis.joint_limits`. Not of the paper."""
+
+    def residuals(self, pose: Tensor) -> Tensor:
+        """Rows (N, 23), radians beyond its limits, of the joints of poses (N, 3 J) but the root."""
+        return beyond_limits(pose.reshape(len(pose), -1, 3)[:, : len(SMPL_JOINTS)])[:, 1:]
+
+    def row_derivatives(self, changes: Tensor, pose: Tensor) -> Tensor:
+        """How the rows change with the pose: (N, 23, P) of changes (N, 3 J, P); each row moves with its joint alone."""
+        with torch.enable_grad():
+            turns = pose.detach().reshape(len(pose), -1, 3)[:, : len(SMPL_JOINTS)].requires_grad_()
+            (slope,) = torch.autograd.grad(beyond_limits(turns).sum(), turns)
+        of_joints = changes.unflatten(1, (-1, 3))[:, 1 : len(SMPL_JOINTS)]
+        return (slope[:, 1:, :, None] * of_joints).sum(2)
 
 
 class UsualShape(SumOfSquares):

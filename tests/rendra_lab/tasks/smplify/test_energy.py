@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rendra.body import SMPL_JOINTS
-from rendra_lab.tasks.smplify.energy import NaturalBends, NaturalPose, Reprojection, UsualShape
+from rendra_lab.tasks.smplify.energy import JointLimits, NaturalBends, NaturalPose, Reprojection, UsualShape
 from rendra_lab.tasks.smplify.pose_prior import PosePrior
 from rendra_lab.tasks.smplify.records import joint_weights
 from rendra_lab.terms import LossTerm
@@ -43,6 +43,7 @@ def test_written_derivatives_are_autograds() -> None:
     check_derivatives(Reprojection(20.0).double(), 30 * near_one(3, 3, 14, 2), 30 * near_one(4, 3, 14, 2), **seen())
     check_derivatives(NaturalPose(PosePrior.built_in()).double(), 0.3 * near_one(5, 3, 72))
     check_derivatives(NaturalBends().double(), near_one(6, 3, 72))
+    check_derivatives(JointLimits(), near_one(8, 3, 72))
     check_derivatives(UsualShape(), near_one(7, 3, 10))
 
 
