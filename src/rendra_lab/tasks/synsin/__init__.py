@@ -1,0 +1,1 @@
+"""SynSin: a new view from a single picture. Wiles, Gkioxari, Szeliski and Johnson, CVPR 2020."""
