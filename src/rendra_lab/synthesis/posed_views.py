@@ -1,6 +1,6 @@
 """Views of generated places with their depth, and the contract of whatever makes them.
 
-Axes of cameras are OpenCV's: x right, y down, z forwards. Pixels: x right, y down, the middle of the first one at 0.5.
+Axes of cameras are OpenCV's: x right, y down, z forwards. Pixels: x right, y down, the first one's middle at 0.5.
 Letters: V views of one place, H x W pixels.
 """
 
