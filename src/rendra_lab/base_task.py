@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar, cast
 
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -39,8 +39,8 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
         self, losses: Mapping[str, LossTerm] | None = None, metrics: Mapping[str, MetricTerm] | None = None
     ) -> None:
         super().__init__()
-        self.losses = nn.ModuleDict(_without_nulls(losses))
-        self.metrics = nn.ModuleDict(_without_nulls(metrics))
+        self.losses = nn.ModuleDict(without_nulls(losses))
+        self.metrics = nn.ModuleDict(without_nulls(metrics))
         self.step_losses: dict[str, Tensor] = {}  # by name, of the update to come: what `NanGuard` judges
 
     @abstractmethod
@@ -62,6 +62,11 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
     def score(self, prediction: PredictionT, batch: BatchT) -> dict[str, Tensor | Metric]:
         """Every metric on this batch, by name."""
         return {name: _named(name, term, prediction, batch) for name, term in self.metrics.items()}
+
+    def watched(self, prediction: PredictionT, batch: BatchT) -> dict[str, Any]:
+        """The metrics that are followed during training, as they are logged."""
+        metrics = cast(Iterator[tuple[str, MetricTerm]], self.metrics.items())
+        return {f"train/{name}": _named(name, term, prediction, batch) for name, term in metrics if term.in_training}
 
     def observe(self, batch: BatchT) -> PredictionT:
         """What evaluation predicts; modes, gradients and random state stay untouched."""
@@ -151,10 +156,7 @@ class Task(BaseTask[BatchT, PredictionT]):
 
     def objective(self, prediction: PredictionT, batch: BatchT) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum, a scalar, and every term without its weight."""
-        terms = {name: _named(name, term, prediction, batch) for name, term in self.losses.items()}
-        step = self.global_step
-        total = sum(term.weight_at(step) * terms[name] for name, term in self._weighted())
-        return torch.as_tensor(total), terms
+        return weighted_sum(self.losses, prediction, batch, self.global_step)
 
     def residuals(self, batch: BatchT) -> Tensor:
         """The vector (R,) whose squared length is the objective; TypeError for a term without residuals."""
@@ -171,11 +173,7 @@ class Task(BaseTask[BatchT, PredictionT]):
         total, terms = self.objective(prediction, batch)
         values = {f"train/loss_{name}": value.detach() for name, value in terms.items()}
         self.step_losses = {"train/loss": total.detach(), **values}
-        metrics = cast(Iterator[tuple[str, MetricTerm]], self.metrics.items())
-        watched = {
-            f"train/{name}": _named(name, term, prediction, batch) for name, term in metrics if term.in_training
-        }
-        self.log_dict({**self.step_losses, **watched}, prog_bar=True, batch_size=1)
+        self.log_dict({**self.step_losses, **self.watched(prediction, batch)}, prog_bar=True, batch_size=1)
         return total
 
     def finish(self) -> None:
@@ -215,21 +213,30 @@ class Task(BaseTask[BatchT, PredictionT]):
             return optimizer
         keywords = {}
         if "total_steps" in inspect.signature(self._make_scheduler).parameters:
-            keywords["total_steps"] = self._total_steps()
+            keywords["total_steps"] = steps_in_all(self.trainer)
         scheduler = self._make_scheduler(optimizer, **keywords)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _weighted(self) -> Iterator[tuple[str, LossTerm]]:
         return cast(Iterator[tuple[str, LossTerm]], self.losses.items())
 
-    def _total_steps(self) -> int:
-        total = self.trainer.estimated_stepping_batches
-        if not math.isfinite(total):
-            raise ValueError("this scheduler needs an end: set trainer.max_steps or trainer.max_epochs")
-        return int(total)
+
+def weighted_sum(losses: nn.ModuleDict, prediction: Any, batch: Any, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+    """An objective of named `LossTerm`s at a step, a scalar, and every term without its weight."""
+    terms = {name: _named(name, term, prediction, batch) for name, term in losses.items()}
+    weights = {name: cast(LossTerm, term).weight_at(step) for name, term in losses.items()}
+    return torch.as_tensor(sum(weights[name] * value for name, value in terms.items())), terms
 
 
-def _without_nulls(terms: Mapping[str, Any] | None) -> dict[str, Any]:
+def steps_in_all(trainer: Trainer) -> int:
+    """How many steps a fit will have; ValueError where it has no end."""
+    total = trainer.estimated_stepping_batches
+    if not math.isfinite(total):
+        raise ValueError("this scheduler needs an end: set trainer.max_steps or trainer.max_epochs")
+    return int(total)
+
+
+def without_nulls(terms: Mapping[str, Any] | None) -> dict[str, Any]:
     """A term set to null in the configuration is switched off."""
     return {name: term for name, term in (terms or {}).items() if term is not None}
 

@@ -94,7 +94,9 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
     seed_everything(_seed(cfg), workers=True, verbose=False)
     shared = {} if cfg.scene is None else {"scene": instantiate(cfg.scene, _convert_="all")}
     data = instantiate(cfg.data, _convert_="all", **shared)
-    rehearse(*(instantiate(part, _convert_="all") for part in (cfg.optimizer, cfg.scheduler)))
+    for name in [name for name in ("optimizer", "adversary_optimizer") if name in cfg]:
+        optimizer, scheduler = (instantiate(part, _convert_="all") for part in (cfg[name], cfg.scheduler))
+        rehearse(optimizer, scheduler, name)
     task = instantiate(cfg.module, _convert_="all", **shared)
     settings: dict[str, Any] = dict(_ALONE)
     if observers:
@@ -322,7 +324,7 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
     tree["module"] = {
         key: value
         for key, value in tree["module"].items()
-        if key not in ("losses", "metrics", "optimizer", "scheduler")
+        if key.removeprefix("adversary_") not in ("losses", "metrics", "optimizer", "scheduler")
     }
     flat = {key: value for name in tree if name not in skipped for key, value in _leaves(tree[name], str(name))}
     return {**flat, "trainer.max_steps": tree["trainer"].get("max_steps")}

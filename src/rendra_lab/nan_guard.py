@@ -2,7 +2,7 @@
 
 The guard looks once before every update of an optimizer, at numbers that the step has made anyway: all losses and the
 norm of all gradients are judged together, and one boolean is read from the device. A task whose objectives have
-optimizers of their own, each stepped by hand, is guarded update by update, as each of them passes here.
+optimizers of their own makes all gradients before the first update (`AdversarialTask`): a step is left out whole.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class NanGuard(Callback):
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         """Judges losses and gradients; leaves the update out, or raises NotFiniteError."""
         losses = pl_module.step_losses if isinstance(pl_module, BaseTask) else {}
-        gradients = {} if _scales(trainer) else dict(_gradients(pl_module, optimizer))
+        gradients = {} if _scales(trainer) else dict(_gradients(pl_module))
         if _everywhere(trainer, _seem_finite(losses.values(), gradients.values())):
             self._in_a_row = 0
             return
@@ -101,7 +101,7 @@ class NanGuard(Callback):
         bad += [f"the gradient of {name}" for name, each in gradients.items() if not bool(each.isfinite().all())]
         if _everywhere(trainer, not bad):  # numbers so large that their sum is not: the optimizer's own business
             return
-        self._react(trainer, optimizer, bad, guilty)
+        self._react(trainer, bad, guilty)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -131,7 +131,7 @@ class NanGuard(Callback):
         """From a checkpoint."""
         self.skipped, self._in_a_row = state_dict["skipped"], state_dict["in_a_row"]
 
-    def _react(self, trainer: Trainer, optimizer: Optimizer, bad: list[str], guilty: int) -> None:
+    def _react(self, trainer: Trainer, bad: list[str], guilty: int) -> None:
         step = trainer.global_step
         place = self._keep(trainer, step, bad, guilty)
         words = f"{_listed(bad) if bad else 'a loss of another process is'} not finite at step {step}"
@@ -144,9 +144,10 @@ class NanGuard(Callback):
             raise NotFiniteError(f"{words}, the last of {self._in_a_row} in a row{where}")
         if trainer.is_global_zero:
             log.warning("%s: left out%s", words, where)
-        for group in optimizer.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
+        for optimizer in trainer.optimizers:
+            for group in optimizer.param_groups:
+                for parameter in group["params"]:
+                    parameter.grad = None
 
     def _keep(self, trainer: Trainer, step: int, bad: list[str], guilty: int) -> Path | None:
         """The folder of this step; None where enough are kept."""
@@ -173,9 +174,10 @@ class NanGuard(Callback):
             self._collecting = False
 
 
-def _gradients(module: LightningModule, optimizer: Optimizer) -> Iterator[tuple[str, Tensor]]:
-    """What an optimizer is about to use, by the names of the parameters."""
-    own = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
+def _gradients(module: LightningModule) -> Iterator[tuple[str, Tensor]]:
+    """What optimizers are about to use, by the names of the parameters."""
+    groups = [group for optimizer in module.trainer.optimizers for group in optimizer.param_groups]
+    own = {id(parameter) for group in groups for parameter in group["params"]}
     for name, parameter in module.named_parameters():
         if id(parameter) in own and parameter.grad is not None:
             gradient = parameter.grad

@@ -165,11 +165,18 @@ def check_numbers(group: str, hint: Any, **numbers: float | None) -> None:
         check_value(number, hint, f"{group}.{name}")
 
 
-def rehearse(optimizer: Callable[..., Any] | None, scheduler: Callable[..., Any] | None) -> None:
-    """Makes both once with one weight, so that what they refuse is known before a fit begins; UserError."""
+def rehearse(
+    optimizer: Callable[..., Any] | None, scheduler: Callable[..., Any] | None, name: str = "optimizer"
+) -> None:
+    """Makes both once with one weight, so that what they refuse is known before a fit begins; UserError.
+
+    Args:
+        optimizer, scheduler: what makes them; None makes none.
+        name: of the optimizer's settings, for complaints.
+    """
     if optimizer is None:
         return
-    with _refusals_named("optimizer"):
+    with _refusals_named(name):
         made = optimizer([torch.nn.Parameter(torch.zeros(1))])
     if scheduler is not None:
         with _refusals_named("scheduler"):

@@ -1,0 +1,162 @@
+"""What a task is whose generator is judged by a network that learns beside it: two objectives, two optimizers."""
+
+from __future__ import annotations
+
+import inspect
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from rendra_lab.base_task import BaseTask, BatchT, PredictionT, steps_in_all, weighted_sum, without_nulls
+from rendra_lab.records import TensorRecord
+from rendra_lab.terms import LossTerm, MetricTerm
+
+FAKE, REAL = "fake", "real"
+
+
+class AdversarialTask(BaseTask[BatchT, PredictionT]):
+    """A generator, the task itself, and perhaps an adversary that tells its pictures from real ones.
+
+    A task writes `predict`, and `shown`, which says what the adversary is shown. Terms of the generator's objective
+    read fields of the prediction and, as `fake` and `real`, what the adversary says of both kinds of pictures;
+    terms of the adversary's objective read `fake` and `real`, with the generator cut off. The gradients of both
+    objectives are made before either network moves: a step is one step of the fit, whole or not at all.
+
+    Args:
+        losses: the named terms of the generator's objective; at least one.
+        optimizer: makes the generator's optimizer from parameters (a partial of a `torch.optim` class).
+        adversary: the network that judges; None trains without, and then no term may read `fake` or `real`.
+        adversary_losses: the named terms of its objective.
+        adversary_optimizer: makes its optimizer.
+        metrics: the named terms of the score.
+        scheduler: makes the learning-rate scheduler of either optimizer, stepped after every step; None keeps rates.
+
+    Raises:
+        ValueError: an objective without terms, or a network without an optimizer.
+    """
+
+    def __init__(
+        self,
+        losses: Mapping[str, LossTerm],
+        optimizer: Callable[..., Optimizer],
+        adversary: nn.Module | None = None,
+        adversary_losses: Mapping[str, LossTerm] | None = None,
+        adversary_optimizer: Callable[..., Optimizer] | None = None,
+        metrics: Mapping[str, MetricTerm] | None = None,
+        scheduler: Callable[..., Any] | None = None,
+    ) -> None:
+        super().__init__(losses, metrics)
+        self.automatic_optimization = False
+        self.adversary = adversary
+        self.adversary_losses = nn.ModuleDict(without_nulls(adversary_losses) if adversary is not None else {})
+        if not self.losses:
+            raise ValueError("a task needs at least one loss, such as loss=[l1]")
+        if optimizer is None or (adversary is not None and adversary_optimizer is None):
+            raise ValueError("each of the two networks needs an optimizer: optimizer and adversary_optimizer")
+        if adversary is not None and not self.adversary_losses:
+            raise ValueError("an adversary needs at least one loss, such as adversary_loss=[hinge_discriminator]")
+        self._make_optimizers = [optimizer] if adversary_optimizer is None else [optimizer, adversary_optimizer]
+        self._make_scheduler = scheduler
+
+    @abstractmethod
+    def shown(self, prediction: PredictionT, batch: BatchT) -> tuple[Tensor, Tensor]:
+        """Pictures (B, 3, H, W) for the adversary: the generator's, with gradients, and real ones."""
+
+    def training_step(self, batch: BatchT, batch_idx: int) -> Tensor:
+        """Lightning's hook: one step of both networks, logged under `train/`."""
+        step = self.global_step
+        prediction = self.predict(batch)
+        total, values = self._generator_objective(prediction, batch, step)
+        self.manual_backward(total)
+        if self.adversary is not None:
+            doubt, more = self._adversary_objective(prediction, batch, step)
+            self.manual_backward(doubt)
+            values |= more
+        self.step_losses = values
+        self.log_dict({**values, **self.watched(prediction, batch)}, prog_bar=True, batch_size=1)
+        self._move()
+        return total.detach()
+
+    def configure_optimizers(self) -> Any:
+        """Lightning's hook: the generator's optimizer, the adversary's, and their schedulers."""
+        networks = [self.generator_parameters()]
+        networks += [] if self.adversary is None else [list(self.adversary.parameters())]
+        optimizers = [make(network) for make, network in zip(self._make_optimizers, networks, strict=False)]
+        if self._make_scheduler is None:
+            return optimizers
+        keywords = {}
+        if "total_steps" in inspect.signature(self._make_scheduler).parameters:
+            keywords["total_steps"] = steps_in_all(self.trainer)
+        return optimizers, [self._make_scheduler(optimizer, **keywords) for optimizer in optimizers]
+
+    def generator_parameters(self) -> list[nn.Parameter]:
+        """All that is trained and not the adversary's."""
+        theirs = set() if self.adversary is None else set(self.adversary.parameters())
+        return [each for each in self.parameters() if each.requires_grad and each not in theirs]
+
+    def _generator_objective(
+        self, prediction: PredictionT, batch: BatchT, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        fields = {name: getattr(prediction, name) for name in cast(TensorRecord, prediction).names()}
+        if self.adversary is not None and any(term.prediction in (FAKE, REAL) for term in self._terms(self.losses)):
+            made, real = self.shown(prediction, batch)
+            with _frozen(self.adversary):
+                fields[FAKE] = self.adversary(made)
+                with torch.no_grad():
+                    fields[REAL] = self.adversary(real)
+        total, terms = weighted_sum(self.losses, fields, batch, step)
+        return total, _named_losses("", total, terms)
+
+    def _adversary_objective(
+        self, prediction: PredictionT, batch: BatchT, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        assert self.adversary is not None
+        made, real = self.shown(prediction, batch)
+        fields = {FAKE: self.adversary(made.detach()), REAL: self.adversary(real)}
+        total, terms = weighted_sum(self.adversary_losses, fields, batch, step)
+        return total, _named_losses("adversary_", total, terms)
+
+    def _move(self) -> None:
+        """One update of each network; Lightning counts the generator's alone as a step of the fit."""
+        optimizers, schedulers = self.optimizers(), self.lr_schedulers()
+        for number, optimizer in enumerate(optimizers if isinstance(optimizers, list) else [optimizers]):
+            if number > 0:
+                optimizer._on_before_step = optimizer._on_after_step = _count_nothing  # type: ignore[union-attr]
+            optimizer.step()
+            optimizer.zero_grad()
+        for scheduler in schedulers if isinstance(schedulers, list) else [schedulers]:
+            if scheduler is not None:
+                scheduler.step()  # type: ignore[call-arg]
+
+    @staticmethod
+    def _terms(losses: nn.ModuleDict) -> Iterator[LossTerm]:
+        yield from losses.values()  # type: ignore[misc]
+
+
+def _named_losses(who: str, total: Tensor, terms: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {
+        f"train/{who}loss": total.detach(),
+        **{f"train/loss_{name}": each.detach() for name, each in terms.items()},
+    }
+
+
+def _count_nothing() -> None:
+    """In the place of Lightning's count of steps."""
+
+
+@contextmanager
+def _frozen(network: nn.Module) -> Iterator[None]:
+    """Gradients pass through a network and leave none in it; as in evaluation, nothing in it moves."""
+    trained = [each for each in network.parameters() if each.requires_grad]
+    for each in trained:
+        each.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for each in trained:
+            each.requires_grad_(True)
