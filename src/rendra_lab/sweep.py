@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, flag_override
@@ -28,7 +29,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.html_report import leave_sweep_report
 from rendra_lab.ledger import JobState, Ledger
 from rendra_lab.report import format_number, short_path, shown_metrics, write_json, write_text
-from rendra_lab.sweep_job import SweepOptions, job_key
+from rendra_lab.sweep_job import SweepOptions, job_key, swept_values
 
 Row = dict[str, Any]
 
@@ -127,12 +128,17 @@ def sweep_key(config: DictConfig) -> str:
 def _swept_words(config: DictConfig) -> str:
     overrides = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
     swept = [
-        f"{item.get_key_element()}={'-'.join(item.sweep_string_iterator()) if item.is_discrete_sweep() else 'search'}"
+        f"{item.get_key_element()}={_in_words(item) if item.is_discrete_sweep() else 'search'}"
         for item in overrides
         if item.is_sweep_override()
     ]
     chosen = OmegaConf.select(config, "hydra.runtime.choices.hparams_search")
     return _words(",".join(sorted(swept)), 48) or str(chosen or "all")
+
+
+def _in_words(override: Override) -> str:
+    values = swept_values(override)
+    return values if isinstance(values, str) else "-".join(values)
 
 
 def conclude_sweep() -> bool | None:
@@ -221,7 +227,8 @@ def _cells(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     """The table as text: settings that are the same everywhere are left out."""
     keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     varied = [key for key in keys if len({row["settings"].get(key) for row in rows}) > 1]
-    names = list(dict.fromkeys(name for row in rows for name in row["metrics"]))
+    best = [row["optimized_metric"] for row in rows if row["optimized_metric"] in row["metrics"]]
+    names = list(dict.fromkeys([*best, *(name for row in rows for name in row["metrics"])]))
     columns = ["job", *varied, *names, "seconds", "status"]
     lines = [
         [
@@ -234,6 +241,21 @@ def _cells(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
         for row in rows
     ]
     return columns, lines
+
+
+def _within(
+    width: int, columns: list[str], lines: list[list[str]], metrics: int
+) -> tuple[list[str], list[list[str]], int]:
+    """The table without the last of its metrics, as many as do not fit into a width, and how many these are."""
+    shown = [
+        max(len(cell.removeprefix("test/")) for cell in column) + 3 for column in zip(columns, *lines, strict=True)
+    ]
+    left_out, last = 0, len(columns) - 2  # behind the metrics stand the time and the status
+    while left_out < metrics - 1 and sum(shown) + 1 > width:
+        left_out, last = left_out + 1, last - 1
+        del shown[last]
+    columns, *lines = ([*row[:last], *row[-2:]] for row in (columns, *lines))
+    return columns, lines, left_out
 
 
 def _shortened(setting: str) -> str:
@@ -255,6 +277,9 @@ def _print_table(folder: Path, rows: list[Row]) -> None:
 
     console = Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH)
     columns, lines = _cells(rows)
+    columns, lines, left_out = _within(
+        console.width, columns, lines, len({name for row in rows for name in row["metrics"]})
+    )
     best = rows[0]["optimized_metric"] if rows else None
     table = Table(title=f"{len(rows)} runs" + (f", best {best} first" if best else ""))
     for column in columns:
@@ -265,6 +290,8 @@ def _print_table(folder: Path, rows: list[Row]) -> None:
         table.add_row(*line, style="red" if row["status"] != "ok" else None)
     place = short_path(folder)
     console.print(table)
+    if left_out:
+        console.print(f"{left_out} more metrics in {place}/summary.md", highlight=False, soft_wrap=True)
     for row in rows:
         if row["status"] not in ("ok", "waiting"):
             reason = _one_line(row["error"] or "its process ended without a word")

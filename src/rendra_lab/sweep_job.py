@@ -19,7 +19,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, QuotedString
+from hydra.core.override_parser.types import Override, QuotedString, ValueType
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from rendra_lab.errors import UserError
@@ -38,7 +38,7 @@ def job_key(overrides: Sequence[str]) -> str:
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if not override.is_hydra_override() and key not in _BESIDE_THE_POINT and not key.startswith("sweep."):
-            settings[key] = _swept(override) if override.is_sweep_override() else _plain(override.value())
+            settings[key] = swept_values(override) if override.is_sweep_override() else _plain(override.value())
     canonical = json.dumps(settings, sort_keys=True)
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 
@@ -214,9 +214,9 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _swept(override: Override) -> Any:
-    """What an override of a sweep goes through: values, or an interval as it was written."""
-    if override.is_discrete_sweep():
+def swept_values(override: Override) -> list[str] | str:
+    """What an override of a sweep goes through: values, or an interval or a pattern as it was written."""
+    if override.is_discrete_sweep() and override.value_type != ValueType.GLOB_CHOICE_SWEEP:
         return list(override.sweep_string_iterator())
     return str(override.input_line).partition("=")[2]
 

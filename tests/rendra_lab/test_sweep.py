@@ -17,7 +17,8 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from rendra_lab_toy import ToyTask
 
 from rendra_lab import origins
-from rendra_lab.sweep import collect, job_folder
+from rendra_lab.sweep import _print_table, collect, job_folder
+from rendra_lab.sweep_job import job_key
 
 HERE = Path(__file__).parent
 LIGHT = str(HERE / "sweep_program.py")  # without torch: a second, not ten
@@ -305,6 +306,26 @@ def test_names_of_folders_are_harmless() -> None:
     assert job_folder(3, "+note=../a/b c,x=1") == "3_note=..-a-b-c-x=1"
     assert job_folder(0, "") == "0"
     assert len(job_folder(1, "x=" + "y" * 500)) < 100
+
+
+def test_a_pattern_of_experiments_is_a_sweep() -> None:
+    """Hydra lists what a pattern means only once jobs are made; folder and key are wanted before."""
+    sweep = job_key(["task=pose", "experiment=glob(pose_*)"])
+    assert sweep == job_key(["experiment=glob(pose_*)", "task=pose"]) != job_key(["task=pose", "experiment=glob(x*)"])
+
+
+def test_a_table_leaves_out_what_does_not_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metrics = {f"test/metric_{index}": float(index) for index in range(40)}
+    row = {"metrics": metrics, "seconds": 1.0, "status": "ok", "error": None, "optimized_metric": "test/metric_30"}
+    rows = [{**row, "job": job, "settings": {"lr": str(job)}, "folder": str(job)} for job in range(2)]
+    _print_table(tmp_path, rows)
+    said = capsys.readouterr().out
+    head = said.splitlines()[2]
+    assert re.findall(r"[a-z]\w*", head)[:3] == ["job", "lr", "metric_30"]
+    assert re.findall(r"[a-z]\w*", head)[-2:] == ["seconds", "status"]
+    shown = len(re.findall(r"metric_", head))
+    assert f"{40 - shown} more metrics in" in said
+    assert max(map(len, said.splitlines()[1:6])) <= 140
 
 
 @pytest.mark.slow
