@@ -36,10 +36,48 @@ def check_faces(face_verts: Tensor, first_face: Tensor, num_faces: Tensor, neigh
 
 
 def _ranges_are_inside(first_face: Tensor, num_faces: Tensor, total: int) -> bool:
-    """Whether all face ranges lie in [0, total); on the CPU only: elsewhere torch itself checks on gathering."""
+    """Whether all ranges lie in [0, total); on the CPU only: elsewhere torch itself checks on gathering."""
     if first_face.device.type != "cpu" or not len(first_face):
         return True
     return bool(((first_face >= 0) & (num_faces >= 0) & (first_face + num_faces <= total)).all())
+
+
+def check_points(points: Tensor, radius: Tensor, first_point: Tensor, num_points: Tensor) -> None:
+    """Shapes, types, devices and ranges of packed points with a radius each; ranges on the CPU only.
+
+    Raises:
+        ValueError: naming the argument, what it was and what was expected.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or not points.is_floating_point():
+        raise ValueError(f"points must be floats of shape (P, 3), got {points.dtype} of {tuple(points.shape)}")
+    if radius.shape != points.shape[:1] or radius.dtype != points.dtype or radius.device != points.device:
+        raise ValueError(
+            f"radius must be {points.dtype} of shape ({len(points)},) on {points.device}, like the points, got "
+            f"{radius.dtype} of {tuple(radius.shape)} on {radius.device}"
+        )
+    if radius.device.type == "cpu" and not bool((radius >= 0).all()):
+        raise ValueError("radius must be zero or positive (NDC distance), got a negative number or NaN")
+    if first_point.shape != num_points.shape or first_point.ndim != 1:
+        raise ValueError(
+            "cloud_to_packed_first_idx and num_points_per_cloud must both have shape (N,), got "
+            f"{tuple(first_point.shape)} and {tuple(num_points.shape)}"
+        )
+    for name, index in (("cloud_to_packed_first_idx", first_point), ("num_points_per_cloud", num_points)):
+        if index.dtype != torch.int64 or index.device != points.device:
+            raise ValueError(f"{name} must be int64 on {points.device}, got {index.dtype} on {index.device}")
+    if not _ranges_are_inside(first_point, num_points, len(points)):
+        raise ValueError(f"cloud_to_packed_first_idx + num_points_per_cloud leaves the {len(points)} points given")
+
+
+def check_image_size(image_size: tuple[int, int]) -> None:
+    """Size of the image.
+
+    Raises:
+        ValueError: it is empty.
+    """
+    height, width = image_size
+    if height < 1 or width < 1:
+        raise ValueError(f"image_size must be (height, width) of at least one pixel, got {tuple(image_size)}")
 
 
 def check_raster(image_size: tuple[int, int], blur_radius: float) -> None:
@@ -48,9 +86,7 @@ def check_raster(image_size: tuple[int, int], blur_radius: float) -> None:
     Raises:
         ValueError: naming the argument, what it was and what was expected.
     """
-    height, width = image_size
-    if height < 1 or width < 1:
-        raise ValueError(f"image_size must be (height, width) of at least one pixel, got {tuple(image_size)}")
+    check_image_size(image_size)
     if not blur_radius >= 0:
         raise ValueError(f"blur_radius must be zero or positive (squared NDC distance), got {blur_radius}")
 
