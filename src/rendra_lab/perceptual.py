@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra_lab import report
+from rendra_lab.metrics import Scores
 from rendra_lab.networks.efficientnet_lite import EfficientNetLite0, has_weights, weights_file
 from rendra_lab.terms import MetricTerm
 
@@ -40,10 +41,24 @@ class PerceptualLite0:
                 "perceptual_lite0 compares images (B, H, W, 3) or (H, W, 3) of one shape, got "
                 f"{tuple(prediction.shape)} and {tuple(target.shape)}"
             )
+        if prediction.ndim == 3:
+            prediction, target = prediction[None], target[None]
+        return self.of_each(prediction, target).value.mean()
+
+    def of_each(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Scores:
+        """Of each of (B, H, W, 3); with a mask (B, H, W), black in both images where it is not above 0.5.
+
+        Images whose mask is empty are not counted.
+        """
+        counted = torch.ones(len(prediction), dtype=torch.bool, device=prediction.device)
+        if mask is not None:
+            inside = mask > 0.5
+            counted = inside.flatten(1).any(1)
+            prediction, target = prediction * inside[..., None], target * inside[..., None]
         network = _network(prediction.device)
         pairs = zip(network.levels(_shown(prediction)), network.levels(_shown(target)), strict=True)
         layers = [(_unit(seen) - _unit(wanted)).square().sum(1).mean((1, 2)) for seen, wanted in pairs]
-        return torch.stack(layers).sum(0).mean()
+        return Scores(torch.stack(layers).sum(0), counted)
 
 
 def perceptual_if_installed() -> MetricTerm | None:
@@ -62,7 +77,7 @@ def _network(device: torch.device) -> EfficientNetLite0:
 
 def _shown(images: Tensor) -> Tensor:
     """(B, 3, H, W) float32."""
-    batch = (images if images.ndim == 4 else images[None]).movedim(-1, 1).float()
+    batch = images.movedim(-1, 1).float()
     shorter = min(batch.shape[-2:])
     if shorter >= _SMALLEST_PX:
         return batch

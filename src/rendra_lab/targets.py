@@ -41,6 +41,8 @@ _ALLOWED_FUNCTIONS = (
     "rendra_lab.schedulers",
     "rendra_lab.tasks.smplify.pose_prior",
     "rendra_lab.tasks.smplify.scores",
+    "rendra_lab.tasks.synsin.adversarial_losses",
+    "rendra_lab.tasks.synsin.scores",
     "torch.nn.functional",
     "torchmetrics.functional",
 )

@@ -100,6 +100,15 @@ class GeneratedPairs(PairData):
             test=ViewPairs(parts["test"], both_ways=False),
         )
 
+    def typical_depth(self) -> float | None:
+        """The median over training places of the median depth of what they show, but sky; None if all is sky."""
+        self.setup("test")
+        train = self.splits.train
+        assert isinstance(train, ViewPairs)
+        seen = (place.depth[place.depth.isfinite()] for place in train.places)
+        medians = [float(depth.median()) for depth in seen if len(depth)]
+        return float(np.median(medians)) if medians else None
+
     def place_seed(self, split: str, index: int) -> int:
         """Of a place, by its number within its split; no other place has it."""
         key = [self.scenes_seed, _SPLITS.index(split), index]

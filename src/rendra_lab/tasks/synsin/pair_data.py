@@ -68,6 +68,10 @@ class PairData(LightningDataModule, ABC):
     def load(self) -> PairSplits:
         """All pairs; UserError says what is wrong with where they come from."""
 
+    def typical_depth(self) -> float | None:
+        """The median depth (metres) of what training pictures show, for comparisons; None where nobody knows it."""
+        return None
+
     def setup(self, stage: str) -> None:
         """Lightning's hook, before the fit and again before the test: loads the pairs, once."""
         if not hasattr(self, "splits"):
