@@ -102,7 +102,9 @@ NAMES = {
         rasterize_meshes rotate_on_spot sigmoid_alpha_blend softmax_rgb_blend specular
         AbsorptionOnlyRaymarcher EmissionAbsorptionRaymarcher HarmonicEmbedding ImplicitRenderer
         GridRaysampler HeterogeneousRayBundle MonteCarloRaysampler MultinomialRaysampler NDCGridRaysampler
-        NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points""",
+        NDCMultinomialRaysampler RayBundle ray_bundle_to_ray_points ray_bundle_variables_to_ray_points
+        AlphaCompositor NormWeightedCompositor PointsRasterizationSettings PointsRasterizer PointsRenderer
+        alpha_composite norm_weighted_sum rasterize_points weighted_sum""",
     "rendra.renderer.blending": "BlendParams hard_rgb_blend sigmoid_alpha_blend softmax_rgb_blend",
     "rendra.renderer.camera_utils": "camera_to_eye_at_up join_cameras_as_batch rotate_on_spot",
     "rendra.renderer.cameras": """
@@ -146,6 +148,14 @@ NAMES = {
         SoftGouraudShader SoftPhongShader SoftSilhouetteShader SplatterPhongShader""",
     "rendra.renderer.mesh.shading": "flat_shading gouraud_shading phong_shading",
     "rendra.renderer.mesh.textures": "TexturesAtlas TexturesBase TexturesUV TexturesVertex",
+    "rendra.renderer.compositing": "alpha_composite norm_weighted_sum weighted_sum",
+    "rendra.renderer.points": """
+        AlphaCompositor NormWeightedCompositor PointFragments PointsRasterizationSettings PointsRasterizer
+        PointsRenderer rasterize_points""",
+    "rendra.renderer.points.compositor": "AlphaCompositor NormWeightedCompositor",
+    "rendra.renderer.points.rasterize_points": "rasterize_points",
+    "rendra.renderer.points.rasterizer": "PointFragments PointsRasterizationSettings PointsRasterizer",
+    "rendra.renderer.points.renderer": "PointsRenderer",
     "rendra.renderer.mesh.utils": "Rectangle PackedRectangle PackedRectangles pack_rectangles pack_unique_rectangles",
 }
 
@@ -488,6 +498,27 @@ SIGNATURES = {
     },
     "rendra.renderer.mesh.rasterizer": {"Fragments": "pix_to_face, zbuf, bary_coords, dists"},
     "rendra.renderer.mesh.shading": {"flat_shading": "meshes, fragments, lights, cameras, materials, texels"},
+    "rendra.renderer.compositing": {
+        "alpha_composite": "pointsidx, alphas, pt_clds",
+        "norm_weighted_sum": "pointsidx, alphas, pt_clds",
+        "weighted_sum": "pointsidx, alphas, pt_clds",
+    },
+    "rendra.renderer.points": {
+        "AlphaCompositor": "background_color=None",
+        "AlphaCompositor.forward": "self, fragments, alphas, ptclds, **kwargs",
+        "NormWeightedCompositor": "background_color=None",
+        "NormWeightedCompositor.forward": "self, fragments, alphas, ptclds, **kwargs",
+        "PointFragments": "idx, zbuf, dists",
+        "PointsRasterizationSettings": """image_size=256, radius=0.01, points_per_pixel=8, bin_size=None,
+            max_points_per_bin=None""",
+        "PointsRasterizer": "cameras=None, raster_settings=None",
+        "PointsRasterizer.transform": "self, point_clouds, **kwargs",
+        "PointsRasterizer.forward": "self, point_clouds, **kwargs",
+        "PointsRenderer": "rasterizer, compositor",
+        "PointsRenderer.forward": "self, point_clouds, **kwargs",
+        "rasterize_points": """pointclouds, image_size=256, radius=0.01, points_per_pixel=8, bin_size=None,
+            max_points_per_bin=None""",
+    },
 }
 
 METHODS = {

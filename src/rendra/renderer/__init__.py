@@ -25,6 +25,7 @@ from rendra.renderer.cameras import (
     look_at_rotation,
     look_at_view_transform,
 )
+from rendra.renderer.compositing import alpha_composite, norm_weighted_sum, weighted_sum
 from rendra.renderer.fisheyecameras import FishEyeCameras
 from rendra.renderer.implicit import (
     AbsorptionOnlyRaymarcher,
@@ -75,6 +76,15 @@ from rendra.renderer.mesh import (
     phong_shading,
     rasterize_meshes,
 )
+from rendra.renderer.points import (
+    AlphaCompositor,
+    NormWeightedCompositor,
+    PointFragments,
+    PointsRasterizationSettings,
+    PointsRasterizer,
+    PointsRenderer,
+    rasterize_points,
+)
 from rendra.renderer.splatter_blend import SplatterBlender
 from rendra.renderer.utils import (
     TensorAccessor,
@@ -86,6 +96,7 @@ from rendra.renderer.utils import (
 
 __all__ = [
     "AbsorptionOnlyRaymarcher",
+    "AlphaCompositor",
     "AmbientLights",
     "BlendParams",
     "CamerasBase",
@@ -113,11 +124,16 @@ __all__ = [
     "MultinomialRaysampler",
     "NDCGridRaysampler",
     "NDCMultinomialRaysampler",
+    "NormWeightedCompositor",
     "OpenGLOrthographicCameras",
     "OpenGLPerspectiveCameras",
     "OrthographicCameras",
     "PerspectiveCameras",
+    "PointFragments",
     "PointLights",
+    "PointsRasterizationSettings",
+    "PointsRasterizer",
+    "PointsRenderer",
     "RasterizationSettings",
     "RayBundle",
     "SfMOrthographicCameras",
@@ -137,6 +153,7 @@ __all__ = [
     "TexturesVertex",
     "VolumeRenderer",
     "VolumeSampler",
+    "alpha_composite",
     "camera_position_from_spherical_angles",
     "camera_to_eye_at_up",
     "cameras_from_colmap",
@@ -156,11 +173,13 @@ __all__ = [
     "look_at_view_transform",
     "ndc_grid_sample",
     "ndc_to_grid_sample_coords",
+    "norm_weighted_sum",
     "opacity_from_density",
     "opencv_from_cameras",
     "opengl_from_cameras",
     "phong_shading",
     "rasterize_meshes",
+    "rasterize_points",
     "ray_bundle_to_ray_points",
     "ray_bundle_variables_to_ray_points",
     "rotate_on_spot",
@@ -168,4 +187,5 @@ __all__ = [
     "softmax_rgb_blend",
     "specular",
     "try_get_projection_transform",
+    "weighted_sum",
 ]

@@ -226,6 +226,40 @@ def try_get_projection_transform(cameras: CamerasBase, cameras_kwargs: dict[str,
         return None
 
 
+def cameras_for_call(cameras: Any, kwargs: dict[str, Any], owner: str) -> Any:
+    """The cameras of one call: those in `kwargs`, else `cameras`; at the pose R, T of `kwargs` where given.
+
+    Raises:
+        ValueError: there are none.
+    """
+    chosen = kwargs.get("cameras", cameras)
+    if chosen is None:
+        raise ValueError(f"Cameras must be specified either at initialization or in the forward pass of {owner}")
+    pose = {name: kwargs[name] for name in ("R", "T") if name in kwargs}
+    if pose:
+        chosen.get_world_to_view_transform(**pose)  # cameras keep the pose that they are given
+    return chosen
+
+
+def ndc_and_view_depth(cameras: Any, points_world: Tensor, kwargs: dict[str, Any]) -> Tensor:
+    """What rasterisers draw: x and y of points (N, P, 3) in NDC, and their depth in view space.
+
+    Args:
+        cameras: one, or N.
+        points_world: (N, P, 3).
+        kwargs: `eps` of the division by depth, and fields of the cameras for this call.
+    """
+    eps = kwargs.get("eps")
+    points_view = cameras.get_world_to_view_transform(**kwargs).transform_points(points_world, eps=eps)
+    to_ndc = cameras.get_ndc_camera_transform(**kwargs)
+    projection = try_get_projection_transform(cameras, kwargs)
+    if projection is not None:
+        points_ndc = projection.compose(to_ndc).transform_points(points_view, eps=eps)
+    else:  # a camera without a matrix projects from the world
+        points_ndc = to_ndc.transform_points(cameras.transform_points(points_world, eps=eps), eps=eps)
+    return torch.cat((points_ndc[..., :2], points_view[..., 2:]), dim=-1)
+
+
 def scale_and_shift(scale: Tensor, shift: Tensor) -> Transform3d:
     """The transform of x and y alone by scale and shift (N, 2)."""
     diagonal = torch.diag_embed(F.pad(scale, (0, 1), value=1.0))

@@ -56,8 +56,9 @@ def _check(idx: Tensor, alphas: Tensor, features: Tensor, mode: str) -> None:
 @torch.library.custom_op("rendra::composite_points", mutates_args=(), device_types="cpu")
 def _composite_on_cpu(idx: Tensor, alphas: Tensor, features: Tensor, mode: int) -> Tensor:
     out = features.new_empty((len(idx), features.shape[1]))
-    arrays = (tensor.contiguous().numpy() for tensor in (idx, alphas, features))
-    numba_cpu.forward(*arrays, mode, out.numpy())
+    numba_cpu.forward(
+        idx.contiguous().numpy(), alphas.contiguous().numpy(), features.contiguous().numpy(), mode, out.numpy()
+    )
     return out
 
 
@@ -70,8 +71,14 @@ def _(idx, alphas, features, mode):  # type: ignore[no-untyped-def]
 def _gradient_on_cpu(
     idx: Tensor, alphas: Tensor, features: Tensor, out: Tensor, grad_out: Tensor, mode: int
 ) -> tuple[Tensor, Tensor]:
-    arrays = (tensor.contiguous().numpy() for tensor in (idx, alphas, features, out, grad_out))
-    grad_alphas, grad_features = numba_cpu.backward(*arrays, mode)
+    grad_alphas, grad_features = numba_cpu.backward(
+        idx.contiguous().numpy(),
+        alphas.contiguous().numpy(),
+        features.contiguous().numpy(),
+        out.numpy(),
+        grad_out.contiguous().numpy(),
+        mode,
+    )
     return torch.from_numpy(grad_alphas), torch.from_numpy(grad_features)
 
 

@@ -1,8 +1,8 @@
 """Points to fragments on the CPU: the fast twin of `reference.py`.
 
-Forward: points are sorted by depth and binned, in that order, into bands of rows; a band is drawn by one thread, point
-by point, so that a pixel's list grows by appending and is complete when it is full. Backward: each of a fixed number
-of chunks of rows sums into a buffer of its own.
+Forward: points are sorted by depth and binned, in that order, into bands of rows; a band is drawn by one thread,
+point by point, so that a pixel's list grows by appending and is complete when it is full. Backward: each of a fixed
+number of chunks of rows sums into a buffer of its own.
 """
 
 import numpy as np

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from rendra.common.datatypes import Device
-from rendra.renderer.camera_base import try_get_projection_transform
+from rendra.renderer.camera_base import cameras_for_call, ndc_and_view_depth
 from rendra.renderer.mesh.rasterize_meshes import rasterize_meshes, rasterize_silhouette
 from rendra.structures.meshes import Meshes
 
@@ -97,12 +96,8 @@ class MeshRasterizer(nn.Module):
             raise ValueError(
                 f"Wrong number ({len(cameras)}) of cameras for {len(meshes_world)} meshes: give one, or one each"
             )
-        eps = kwargs.get("eps")
-        verts_world = meshes_world.verts_padded()
-        verts_view = cameras.get_world_to_view_transform(**kwargs).transform_points(verts_world, eps=eps)
-        verts_ndc = _project(cameras, verts_world, verts_view, kwargs)
-        verts_ndc = torch.cat((verts_ndc[..., :2], verts_view[..., 2:]), dim=-1)
-        return meshes_world.update_padded(new_verts_padded=verts_ndc)
+        verts_seen = ndc_and_view_depth(cameras, meshes_world.verts_padded(), kwargs)
+        return meshes_world.update_padded(new_verts_padded=verts_seen)
 
     def forward(self, meshes_world: Meshes, **kwargs: Any) -> Fragments:
         """Rasterise meshes in world coordinates.
@@ -162,21 +157,6 @@ class MeshRasterizer(nn.Module):
         }
 
 
-def cameras_for_call(cameras: Any, kwargs: dict[str, Any], owner: str) -> Any:
-    """The cameras of one call: those in `kwargs`, else `cameras`; at the pose R, T of `kwargs` where given.
-
-    Raises:
-        ValueError: there are none.
-    """
-    chosen = kwargs.get("cameras", cameras)
-    if chosen is None:
-        raise ValueError(f"Cameras must be specified either at initialization or in the forward pass of {owner}")
-    pose = {name: kwargs[name] for name in ("R", "T") if name in kwargs}
-    if pose:
-        chosen.get_world_to_view_transform(**pose)  # cameras keep the pose that they are given
-    return chosen
-
-
 def _clips_barycentric(settings: RasterizationSettings) -> bool:
     if settings.clip_barycentric_coords is None:
         return settings.blur_radius > 0
@@ -188,14 +168,3 @@ def _half_of_nearest(znear: float | Tensor | None) -> float | None:
     if isinstance(znear, Tensor):
         znear = znear.min().item()
     return None if znear is None else znear / 2
-
-
-def _project(cameras: Any, verts_world: Tensor, verts_view: Tensor, kwargs: dict[str, Any]) -> Tensor:
-    """NDC of vertices: from view space by a projection matrix, or, for cameras without one, from the world."""
-    eps = kwargs.get("eps")
-    to_ndc = cameras.get_ndc_camera_transform(**kwargs)
-    projection = try_get_projection_transform(cameras, kwargs)
-    if projection is not None:
-        return projection.compose(to_ndc).transform_points(verts_view, eps=eps)
-    projected = cameras.transform_points(verts_world, eps=eps)
-    return to_ndc.transform_points(projected, eps=eps)

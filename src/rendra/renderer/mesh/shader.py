@@ -24,9 +24,10 @@ from rendra.renderer.blending import (
     softmax_depth_blend,
     softmax_rgb_blend,
 )
+from rendra.renderer.camera_base import cameras_for_call
 from rendra.renderer.lighting import PointLights
 from rendra.renderer.materials import Materials
-from rendra.renderer.mesh.rasterizer import Fragments, cameras_for_call
+from rendra.renderer.mesh.rasterizer import Fragments
 from rendra.renderer.mesh.shading import (
     flat_shading,
     gouraud_shading,
