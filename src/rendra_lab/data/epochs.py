@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ SampleT_co = TypeVar("SampleT_co", covariant=True)
 _ORDER, _SAMPLE = 0, 1  # what a stream of random numbers is for
 
 
+@runtime_checkable
 class Samples(Protocol[SampleT_co]):
     """Samples by their numbers; they may draw from Python's, NumPy's and torch's global streams."""
 

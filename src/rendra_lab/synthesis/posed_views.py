@@ -7,7 +7,7 @@ Letters: V views of one place, H x W pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -26,6 +26,7 @@ class PosedViews(TensorRecord):
     world_to_camera: Float[Tensor, "V 4 4"]  # columns: camera = matrix @ (x, y, z, 1)
 
 
+@runtime_checkable
 class World(Protocol):
     """Places without end, each of a seed: the same seed and settings, the same place and the same pictures."""
 
