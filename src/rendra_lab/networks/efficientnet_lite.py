@@ -61,18 +61,20 @@ class EfficientNetLite0(nn.Module):
         network.load_state_dict(torch.load(weights_file(), map_location="cpu", weights_only=True))
         return network.eval().requires_grad_(False)
 
-    def levels(self, images: Tensor) -> list[Tensor]:
+    def levels(self, images: Tensor, count: int = len(_LEVELS)) -> list[Tensor]:
         """What the last block of each resolution sees.
 
         Args:
             images: (B, 3, H, W) sRGB in [0, 1].
+            count: of the finest levels; the blocks behind them are not computed.
 
         Returns:
-            Five tensors (B, C, ceil(H / s), ceil(W / s)): C = 16, 24, 40, 112, 320 at s = 2, 4, 8, 16, 32.
+            Five tensors (B, C, ceil(H / s), ceil(W / s)), or the first of them: C = 16, 24, 40, 112, 320 at
+            s = 2, 4, 8, 16, 32.
         """
         x = F.relu6(self._bn0(self._conv_stem((images * _PEAK - _MIDDLE) / _SPREAD)))
         found = []
-        for number, block in enumerate(self._blocks):
+        for number, block in enumerate(self._blocks[: _LEVELS[count - 1] + 1]):
             x = block(x)
             if number in _LEVELS:
                 found.append(x)
