@@ -6,9 +6,10 @@ the same input. Steps of tasks and whole commands are rendra's alone.
 
 from rendra_lab.benchmarks.bodies import BODIES
 from rendra_lab.benchmarks.geometry import GEOMETRY
+from rendra_lab.benchmarks.points import POINTS
 from rendra_lab.benchmarks.radiance import RADIANCE
 from rendra_lab.benchmarks.rays import RAYS
 from rendra_lab.benchmarks.rendering import RENDERING
 from rendra_lab.benchmarks.volumes import VOLUMES
 
-BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *VOLUMES, *BODIES)
+BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *POINTS, *VOLUMES, *BODIES)
