@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning.pytorch import LightningDataModule, Trainer, seed_everything
+from lightning.pytorch import Callback, LightningDataModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.model_helpers import is_overridden
 from omegaconf import DictConfig, OmegaConf
@@ -76,12 +76,13 @@ class Experiment:
         return Path(self.cfg.run_dir)
 
 
-def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
+def build(cfg: DictConfig, *, observers: bool = True, reports: Path | None = None) -> Experiment:
     """Makes the parts that a configuration describes; calls nothing outside the allowed packages.
 
     Args:
         cfg: the composed configuration of `conf/train.yaml`, with `run_dir`.
         observers: False leaves loggers and callbacks out, so that nothing is written.
+        reports: a folder for what callbacks write about a test, which are then not left out.
 
     Raises UserError for a forbidden `_target_` or an argument that it does not take, naming the key.
     """
@@ -98,7 +99,7 @@ def build(cfg: DictConfig, *, observers: bool = True) -> Experiment:
         optimizer, scheduler = (instantiate(part, _convert_="all") for part in (cfg[name], cfg.scheduler))
         rehearse(optimizer, scheduler, name)
     task = instantiate(cfg.module, _convert_="all", **shared)
-    settings: dict[str, Any] = dict(_ALONE)
+    settings: dict[str, Any] = {**_ALONE, "callbacks": _reporters(cfg, reports) if reports else []}
     if observers:
         callbacks = [RandomState(), LogKeeper(), *_parts(cfg.callbacks)]
         for guard in (callback for callback in callbacks if isinstance(callback, NanGuard)):
@@ -181,13 +182,19 @@ def _conclude_early(cfg: DictConfig, record: dict[str, Any], clock: _Clock, erro
     raise SystemExit(128 + number) from None
 
 
-def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, Any] | None = None) -> Experiment:
+def load_run(
+    folder: str | Path,
+    weights: str = "last",
+    overrides: Mapping[str, Any] | None = None,
+    reports: str | Path | None = None,
+) -> Experiment:
     """Rebuilds a run from its folder, with the weights of its checkpoint; nothing is written.
 
     Args:
         folder: of the run.
         weights: `last`, `best`, or the path of a checkpoint or of a `.safetensors` file.
         overrides: dotted keys of the configuration with other values.
+        reports: a folder for the files that the run's callbacks write about a test; None: they write none.
 
     Raises UserError where the folder holds no run, no such checkpoint, or one that is damaged or does not fit.
     """
@@ -200,7 +207,7 @@ def load_run(folder: str | Path, weights: str = "last", overrides: Mapping[str, 
     cfg.run_dir = str(folder)
     for key, value in (overrides or {}).items():
         OmegaConf.update(cfg, key, value)
-    experiment = build(cfg, observers=False)
+    experiment = build(cfg, observers=False, reports=None if reports is None else Path(reports))
     state = read_weights(folder, weights, cfg.module.get("_target_"))
     experiment.data.prepare_data()
     experiment.data.setup("test")
@@ -359,6 +366,15 @@ def _parts(group: DictConfig | None) -> list[Any]:
     """The parts of a group by name, without those switched off by null, or left out: nothing says what they are."""
     named = [part for part in (group or {}).values() if part is not None and "_target_" in part]
     return [instantiate(part, _convert_="all") for part in named]
+
+
+def _reporters(cfg: DictConfig, folder: Path) -> list[Any]:
+    """The callbacks of a configuration that have something to say about a test, as if the run were in a folder."""
+    cfg = cfg.copy()
+    cfg.run_dir = str(folder)
+    hooks = ("on_test_batch_end", "on_test_epoch_end", "on_test_end")
+    told = [part for part in _parts(cfg.callbacks) if any(is_overridden(hook, part, Callback) for hook in hooks)]
+    return [callback for callback in told if not _is_progress(callback)]
 
 
 def _plugins(trainer: DictConfig) -> list[Any]:

@@ -210,13 +210,25 @@ def test_a_distributed_sweep_has_one_folder_and_survives_a_failure(tmp_path: Pat
     assert [run["status"] for run in runs] == ["ok", "failed"]
 
 
-def test_a_finished_run_is_scored_again_by_a_script(train: Train, program: Train, tmp_path: Path) -> None:
-    assert train("debug=fast")[0] == 0
+def test_a_finished_run_is_scored_and_shown_again_by_a_script(train: Train, program: Train, tmp_path: Path) -> None:
+    table = "+callbacks.report={_target_:rendra_lab.callbacks.BatchReport,table:'${run_dir}/exports/batches.csv'}"
+    assert train("debug=fast", table)[0] == 0
     (folder,) = (tmp_path / "outputs" / "toy").iterdir()
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     code, out, _ = program("scripts/evaluate.py", str(folder), "--json")
     assert code == 0
     fitted = json.loads((folder / "metrics.json").read_text())["metrics"]
     assert json.loads(out)["test/psnr"] == fitted["test/psnr"]
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+    code, out, _ = program("scripts/evaluate.py", str(folder), "--output")
+    assert code == 0
+    assert out.rstrip().endswith("evaluation")
+    written = folder / "evaluation" / "exports" / "batches.csv"
+    assert written.read_text() == (folder / "exports" / "batches.csv").read_text()
+    assert set(folder.rglob("*")) == {*before, *written.parents[:2], written}
     code, _, err = program("scripts/evaluate.py", str(folder), "data.sise=3")
     assert code == 2
     assert "data.sise: ToyData takes no 'sise'" in err
+    code, _, err = program("scripts/evaluate.py", str(folder), "--output", "data.size_px=8")
+    assert code == 2
+    assert "--output takes a folder or stands last, got data.size_px=8" in err

@@ -23,6 +23,21 @@ class WarpedView(NamedTuple):
     covered: Bool[Tensor, "B 1 H W"]
 
 
+def baselines(batch: PairBatch, constant_depth: float | None) -> dict[str, Tensor]:
+    """New views (B, 3, H, W), as many as what is known allows: `copy`, `true_warp` and `constant_warp`.
+
+    Args:
+        batch: pairs.
+        constant_depth: of everything that the inputs show, metres; None leaves that warp out.
+    """
+    views = {"copy": copied(batch)}
+    if batch.truth is not None:
+        views["true_warp"] = warped_by_depth(batch, batch.truth.depth).rgb
+    if constant_depth is not None:
+        views["constant_warp"] = warped_by_plane(batch, constant_depth).rgb
+    return views
+
+
 def copied(batch: PairBatch) -> Tensor:
     """The input as if nothing had moved: (B, 3, H, W)."""
     return batch.input
