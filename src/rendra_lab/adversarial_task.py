@@ -6,26 +6,23 @@ import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from rendra_lab.base_task import BaseTask, BatchT, PredictionT, steps_in_all, weighted_sum, without_nulls
-from rendra_lab.records import TensorRecord
 from rendra_lab.terms import LossTerm, MetricTerm
-
-FAKE, REAL = "fake", "real"
 
 
 class AdversarialTask(BaseTask[BatchT, PredictionT]):
     """A generator, the task itself, and perhaps an adversary that tells its pictures from real ones.
 
-    A task writes `predict`, and `shown`, which says what the adversary is shown. Terms of the generator's objective
-    read fields of the prediction and, as `fake` and `real`, what the adversary says of both kinds of pictures;
-    terms of the adversary's objective read `fake` and `real`, with the generator cut off. The gradients of both
-    objectives are made before either network moves: a step is one step of the fit, whole or not at all.
+    A task writes `predict`, and `shown`, which says what the adversary is shown. What the adversary says of made
+    pictures is to the terms of both objectives a field `fake` of the prediction, what it says of real ones a field
+    `real` of the batch; the generator's objective does not reach the adversary, nor the adversary's the generator.
+    The gradients of both are made before either network moves: a step is one step of the fit, whole or not at all.
 
     Args:
         losses: the named terms of the generator's objective; at least one.
@@ -102,14 +99,14 @@ class AdversarialTask(BaseTask[BatchT, PredictionT]):
     def _generator_objective(
         self, prediction: PredictionT, batch: BatchT, step: int
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        fields = {name: getattr(prediction, name) for name in cast(TensorRecord, prediction).names()}
-        if self.adversary is not None and any(term.prediction in (FAKE, REAL) for term in self._terms(self.losses)):
+        seen: tuple[Any, Any] = prediction, batch
+        if self.adversary is not None:
             made, real = self.shown(prediction, batch)
             with _frozen(self.adversary):
-                fields[FAKE] = self.adversary(made)
+                verdict = self.adversary(made)
                 with torch.no_grad():
-                    fields[REAL] = self.adversary(real)
-        total, terms = weighted_sum(self.losses, fields, batch, step)
+                    seen = _Beside(prediction, fake=verdict), _Beside(batch, real=self.adversary(real))
+        total, terms = weighted_sum(self.losses, *seen, step)
         return total, _named_losses("", total, terms)
 
     def _adversary_objective(
@@ -117,8 +114,8 @@ class AdversarialTask(BaseTask[BatchT, PredictionT]):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         assert self.adversary is not None
         made, real = self.shown(prediction, batch)
-        fields = {FAKE: self.adversary(made.detach()), REAL: self.adversary(real)}
-        total, terms = weighted_sum(self.adversary_losses, fields, batch, step)
+        fake = _Beside(prediction, fake=self.adversary(made.detach()))
+        total, terms = weighted_sum(self.adversary_losses, fake, _Beside(batch, real=self.adversary(real)), step)
         return total, _named_losses("adversary_", total, terms)
 
     def _move(self) -> None:
@@ -133,9 +130,23 @@ class AdversarialTask(BaseTask[BatchT, PredictionT]):
             if scheduler is not None:
                 scheduler.step()  # type: ignore[call-arg]
 
-    @staticmethod
-    def _terms(losses: nn.ModuleDict) -> Iterator[LossTerm]:
-        yield from losses.values()  # type: ignore[misc]
+
+class _Beside(Mapping[str, Any]):
+    """A batch or a prediction, and something else under a name of its own."""
+
+    def __init__(self, record: Any, **more: Any) -> None:
+        self._record, self._more = record, more
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._more and not hasattr(self._record, name):
+            raise KeyError(name)
+        return self._more[name] if name in self._more else getattr(self._record, name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._record.names(), *self._more])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
 
 
 def _named_losses(who: str, total: Tensor, terms: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -70,7 +70,7 @@ def painter(**parts: Any) -> Painter:
         "optimizer": sgd,
         "adversary": Adversary(),
         "adversary_losses": {
-            "trusts": LossTerm(lambda real: -real, prediction="real", target=None),
+            "trusts": LossTerm(lambda fake, real: -real, prediction="fake", target="real"),
             "doubts": LossTerm(lambda fake: fake, prediction="fake", target=None),
         },
         "adversary_optimizer": sgd,
