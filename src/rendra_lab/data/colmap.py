@@ -39,7 +39,7 @@ class ColmapViews(FolderViews):
         train, held = self.divided(photographs)
         depth_range = _depths(points, R, T)
         x, y, z = F.normalize(R[:, :, 1].mean(0), dim=0).tolist()
-        return Capture(train, held, held, points=points, depth_range=depth_range, up=(x, y, z))
+        return Capture(train, held, held, points=points, depth_range=depth_range, up=(x, y, z), is_interleaved=True)
 
     def _model_folder(self) -> Path:
         folders = [self.path / "sparse" / "0", self.path / "sparse", self.path]

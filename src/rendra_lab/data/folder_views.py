@@ -41,6 +41,7 @@ class Capture:
     up: tuple[float, float, float] | None = None
     warp: RayWarp | None = None
     remark: str = ""  # what was made up
+    is_interleaved: bool = False  # the format does not divide views: some in between are val and test
 
 
 class FolderViews(SceneViews):

@@ -120,7 +120,7 @@ class LlffViews(FolderViews):
             return Capture(
                 train, held, held, box=_box_of_ndc(photographs, warp), up=up, warp=warp, remark="rays in NDC"
             )
-        return Capture(train, held, held, depth_range=depth_range, up=up)
+        return Capture(train, held, held, depth_range=depth_range, up=up, is_interleaved=True)
 
     def _placed(self, poses: Tensor, bounds: Tensor) -> tuple[Tensor, Tensor]:
         """Poses and bounds in the scene's own frame and unit."""

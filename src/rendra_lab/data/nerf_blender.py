@@ -52,7 +52,7 @@ class NerfBlenderViews(FolderViews):
         if val is None and test is None:
             train, held = self.divided(train)
             remark = f"no transforms_val.json and no transforms_test.json: every {self.hold_out}th view is held out"
-            return Capture(train, held, held, up=up, remark=remark)
+            return Capture(train, held, held, up=up, remark=remark, is_interleaved=True)
         present = (val if test is None else test)[:: self.test_skip]  # type: ignore[index]
         if val is not None and test is not None:
             return Capture(train, val[:: self.test_skip], present, up=up)

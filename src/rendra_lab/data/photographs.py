@@ -100,7 +100,8 @@ def poses_from_opengl(camera_to_world: Tensor, where: Sequence[str]) -> tuple[Te
 def demand_rotations(matrices: Tensor, where: Sequence[str]) -> None:
     """Refuse (N, 3, 3) that scale, shear, mirror or are not finite; `where` says which one it is."""
     off = (matrices.mT @ matrices - torch.eye(3, dtype=matrices.dtype)).abs().flatten(1).amax(1)
-    mirrors = torch.linalg.det(matrices.nan_to_num()) < 0
+    x, y, z = matrices.nan_to_num().unbind(1)
+    mirrors = (torch.linalg.cross(x, y) * z).sum(1) < 0
     bad = ~(off <= _RIGID) | mirrors
     if not bool(bad.any()):
         return

@@ -6,11 +6,12 @@ transforms.json. colmap: a sparse model as text and binary. llff: poses_bounds.n
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
 import uuid
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +50,28 @@ def write_scene(scene: Scene, folder: str | Path, format: str, overwrite: bool =
     """
     check_output(folder, format, overwrite)
     folder = Path(folder).absolute()
+    with folder_in_making(folder) as partial:
+        _WRITERS[format](scene, partial)
+    return folder
+
+
+@contextlib.contextmanager
+def folder_in_making(folder: Path) -> Iterator[Path]:
+    """A hidden new folder beside `folder`, to be filled within the block; then it takes the name.
+
+    What stood there before is replaced whole. Where the block fails, it stays, and nothing else is left.
+
+    Args:
+        folder: absolute; its parents are made.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         partial.mkdir()
-        _WRITERS[format](scene, partial)
+        yield partial
         _put_in_place(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return folder
 
 
 def check_output(folder: str | Path, format: str, overwrite: bool = False) -> None:

@@ -60,7 +60,8 @@ class TransformsViews(FolderViews):
         lists = {split: f"{split}_filenames" for split in ("train", "val", "test") if f"{split}_filenames" in root}
         if not lists:
             train, held = self.divided(photographs)
-            return Capture(train, held, held, up=up, remark=f"every {self.hold_out}th frame is held out")
+            remark = f"every {self.hold_out}th frame is held out"
+            return Capture(train, held, held, up=up, remark=remark, is_interleaved=True)
         by_name = {_tidy(name): photograph for name, photograph in zip(names, photographs, strict=True)}
         chosen = {split: _named(root, key, by_name) for split, key in lists.items()}
         both = next((split for split in ("val", "test") if chosen.get(split)), None)
