@@ -1,4 +1,4 @@
-"""Write posed images, or people, as a folder of a common format: `python scripts/generate_data.py --help`."""
+"""Write posed images, pairs of them, or people, in a common format: `python scripts/generate_data.py --help`."""
 
 from typing import Any
 
@@ -15,11 +15,16 @@ def main(cfg: Any) -> None:
 
     from rendra_lab.data.scene_folders import check_output, write_scene
     from rendra_lab.targets import check_targets
+    from rendra_lab.tasks.synsin.pair_data import PairData
+    from rendra_lab.tasks.synsin.pair_folder_writers import write_pairs
 
     check_targets(OmegaConf.to_container(cfg, resolve=True))
     data = instantiate(cfg.data, _convert_="all")
     if hasattr(data, "write"):  # it knows how: people have a layout of their own
         print(data.write(cfg.output, cfg.overwrite))
+        return
+    if isinstance(data, PairData):
+        print(write_pairs(data, cfg.output, cfg.format, cfg.overwrite))
         return
     target = (cfg.output, cfg.format, cfg.overwrite)
     check_output(*target)
