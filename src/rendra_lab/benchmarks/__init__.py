@@ -10,6 +10,7 @@ from rendra_lab.benchmarks.points import POINTS
 from rendra_lab.benchmarks.radiance import RADIANCE
 from rendra_lab.benchmarks.rays import RAYS
 from rendra_lab.benchmarks.rendering import RENDERING
+from rendra_lab.benchmarks.splats import SPLATS
 from rendra_lab.benchmarks.volumes import VOLUMES
 
-BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *POINTS, *VOLUMES, *BODIES)
+BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *POINTS, *SPLATS, *VOLUMES, *BODIES)

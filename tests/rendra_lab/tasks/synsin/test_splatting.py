@@ -173,7 +173,7 @@ def test_bad_settings_are_named():
     ):
         with pytest.raises(UserError, match=message):
             PointSplatter(**wrong)
-    with pytest.raises(UserError, match="accumulation.*wsumnorm"):
+    with pytest.raises(UserError, match=r"accumulation.*wsumnorm"):
         check_targets({"_target_": "rendra_lab.tasks.synsin.splatting.PointSplatter", "accumulation": "sum"})
 
 
