@@ -142,7 +142,7 @@ def test_configurations_read_folders(tmp_path: Path, name: str, compose: Callabl
     check_targets(tree, "data")
     data = instantiate(tree, _convert_="all")
     data.setup("fit")
-    assert data.splits.test[0].input.shape == (1, 3, 256, 256)
+    assert data.splits.test[0].input.shape == (1, 3, 128, 128)
 
 
 def test_the_program_says_which_formats_are_for_pairs(
