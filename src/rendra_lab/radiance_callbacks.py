@@ -12,10 +12,10 @@ from rendra_lab.base_task import BaseTask
 from rendra_lab.data.ray_views import SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.loggers import TensorBoard
-from rendra_lab.radiance_film import SHOWN, can_write_mp4, shoot
+from rendra_lab.radiance_film import SHOWN, shoot
 from rendra_lab.settings import Count, Size
 from rendra_lab.trajectories import WAYS, trajectory
-from rendra_lab.visualization import Picture, save_animation
+from rendra_lab.visualization import Picture, can_write_mp4, save_animation
 
 _FILES = {"rgb": "turntable", "depth": "depth", "normals": "normals"}
 

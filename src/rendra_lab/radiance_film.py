@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,6 +19,7 @@ from rendra_lab.networks.radiance import RadiancePrediction, view_normals
 from rendra_lab.trajectories import Size, trajectory
 from rendra_lab.visualization import (
     Picture,
+    can_write_mp4,
     captioned_row,
     depth_image,
     depth_limits,
@@ -202,11 +202,6 @@ def render_run(task: Any, data: Any, order: FilmOrder) -> tuple[str, Path]:
         for index, frame in enumerate(frames):
             save_picture(output / f"frame_{index:04d}.png", frame)
     return str(shot), output
-
-
-def can_write_mp4() -> bool:
-    """Whether the extra [view] is there."""
-    return find_spec("av") is not None
 
 
 def _limits(depths: Sequence[Tensor], opacities: Sequence[Tensor]) -> tuple[float, float]:

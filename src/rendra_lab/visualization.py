@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +193,11 @@ def save_picture(path: str | Path, picture: Picture) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).save(path)
     return path
+
+
+def can_write_mp4() -> bool:
+    """Whether the extra [view] is there."""
+    return find_spec("av") is not None
 
 
 def save_animation(path: str | Path, frames: Sequence[Picture], fps: float = 12.0, hold_s: float = 1.0) -> Path:

@@ -14,7 +14,7 @@ from PIL import Image
 from rendra_lab_toy import SphereTask, SphereViews, save_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from rendra_lab import radiance_film
+from rendra_lab import visualization
 from rendra_lab.errors import UserError
 from rendra_lab.experiment import run
 from rendra_lab.losses import SquaredError
@@ -105,7 +105,7 @@ def test_films_go_where_they_are_ordered(data: SphereViews, task: SphereTask, tm
 def test_impossible_orders_are_refused(
     task: SphereTask, data: SphereViews, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(radiance_film, "find_spec", lambda name: None)
+    monkeypatch.setattr(visualization, "find_spec", lambda name: None)
     for order, complaint in (
         ({"what": "heat"}, "what must be rgb, depth, normals or all"),
         ({"output": tmp_path / "a.avi"}, r"must end in .gif or .mp4"),
@@ -134,7 +134,7 @@ def test_a_run_ends_with_films_and_views(
         assert image.n_frames == 6
     said = capsys.readouterr().out
     assert "6 frames of 32x24 rendered in " in said
-    if not radiance_film.can_write_mp4():
+    if not visualization.can_write_mp4():
         assert "no .mp4 without the extra [view]" in said
     rows = list(csv.DictReader((finished / "exports" / "views.csv").read_text().splitlines()))
     assert [row["view"] for row in rows] == ["view_7.png", "view_8.png"]

@@ -132,7 +132,7 @@ class JointLimits(SumOfSquares):
         return beyond_limits(pose.reshape(len(pose), -1, 3)[:, : len(SMPL_JOINTS)])[:, 1:]
 
     def row_derivatives(self, changes: Tensor, pose: Tensor) -> Tensor:
-        """How the rows change with the pose: (N, 23, P) of changes (N, 3 J, P); each row moves with its joint alone."""
+        """How the rows change with the pose: (N, 23, P) of changes (N, 3 J, P); each moves with its own joint."""
         with torch.enable_grad():
             turns = pose.detach().reshape(len(pose), -1, 3)[:, : len(SMPL_JOINTS)].requires_grad_()
             (slope,) = torch.autograd.grad(beyond_limits(turns).sum(), turns)

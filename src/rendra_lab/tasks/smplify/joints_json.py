@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from rendra_lab.data.picture_files import find_picture, upright_size
 from rendra_lab.errors import UserError
 from rendra_lab.tasks.smplify.joint_files import FoundPerson, JointFiles
 from rendra_lab.tasks.smplify.joint_layouts import Joints
-from rendra_lab.tasks.smplify.picture_files import find_picture, upright_size
 from rendra_lab.tasks.smplify.picture_people import GivenPerson, PicturePeople, check_joints
 
 log = logging.getLogger(__name__)

@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.io
 
+from rendra_lab.data.picture_files import find_picture, upright_size
 from rendra_lab.errors import UserError
 from rendra_lab.tasks.smplify.joint_layouts import Joints
-from rendra_lab.tasks.smplify.picture_files import find_picture, upright_size
 from rendra_lab.tasks.smplify.picture_people import (
     MOST_PEOPLE,
     GivenPerson,

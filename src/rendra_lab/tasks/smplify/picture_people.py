@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rendra_lab.data.picture_files import read_upright
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Fraction, check_numbers
 from rendra_lab.tasks.smplify.joint_layouts import Joints
 from rendra_lab.tasks.smplify.people_data import PeopleData, Picture
-from rendra_lab.tasks.smplify.picture_files import read_upright
 from rendra_lab.tasks.smplify.records import LSP_JOINTS, PeopleBatch, joint_weights
 
 MOST_PEOPLE = 100_000

@@ -133,16 +133,17 @@ def pictures_of(
     shown = {name: rgb[index].movedim(0, -1) for name, rgb in images.items()}
     depth, truth = prediction.depth[index, 0], batch.truth
     if truth is None:
-        shown["depth"] = _depth_image(depth)
+        shown["depth"] = log_depth_image(depth)
     else:
         true_depth = truth.depth[index, 0]
         limits = visualization.depth_limits(true_depth.log(), torch.ones_like(true_depth))
-        shown |= {"depth": _depth_image(depth, limits), "true_depth": _depth_image(true_depth, limits)}
+        shown |= {"depth": log_depth_image(depth, limits), "true_depth": log_depth_image(true_depth, limits)}
         shown["visible"] = torch.where(truth.visible[index, 0, :, :, None], shown["target"], _GREY)
     return {name: visualization.to_picture(image) for name, image in shown.items()}
 
 
-def _depth_image(depth: Tensor, limits: tuple[float, float] | None = None) -> Tensor:
+def log_depth_image(depth: Tensor, limits: tuple[float, float] | None = None) -> Tensor:
+    """Depth (..., H, W) in colours (..., H, W, 3) by its logarithm: near yellow, far violet, inf white."""
     there = depth.isfinite()
     return visualization.depth_image(torch.where(there, depth, 1.0).log(), there.to(depth), limits)
 

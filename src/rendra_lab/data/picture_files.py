@@ -1,4 +1,4 @@
-"""Pictures of people, upright.
+"""Pictures of files, upright.
 
 Detectors follow the EXIF data that turn a photograph, and so must what is drawn on it.
 """
