@@ -9,8 +9,8 @@ import numpy as np
 from numba import prange
 
 from rendra.kernels.binning import BAND_ROWS, bin_faces, padded_columns
-from rendra.kernels.geometry import ONE, TWO, pixel_centre
-from rendra.kernels.parallel import num_threads, parallel_kernel
+from rendra.kernels.geometry import BLOCK, ONE, TWO, pixel_centre
+from rendra.kernels.parallel import inlined_kernel, num_threads, parallel_kernel
 from rendra.kernels.point_binning import front_to_back, point_boxes
 
 _CHUNKS = 8  # row groups of an image that sum gradients apart; fixed, so that results never depend on threads
@@ -38,30 +38,49 @@ def forward(
 def _draw(points, radius, boxes, starts, entries, workers, idx, zbuf, dists):
     images, height, width, layers = idx.shape
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
-    short = min(height, width)
     for worker in prange(workers):
         columns = padded_columns(height, width)
-        counts = np.empty((BAND_ROWS, width), np.int32)
+        counts = np.empty(BAND_ROWS * width, np.int64)
         for band in range(worker, images * bands, workers):
             n, row = band // bands, band % bands * BAND_ROWS
             row_end = min(row + BAND_ROWS, height)
+            slots = (
+                idx[n, row:row_end].reshape(-1),
+                zbuf[n, row:row_end].reshape(-1),
+                dists[n, row:row_end].reshape(-1),
+            )
             counts[:] = 0
             for entry in range(starts[band], starts[band + 1]):
                 p = entries[entry]
-                x, y, z, limit = points[p, 0], points[p, 1], points[p, 2], radius[p] * radius[p]
-                for v in range(max(boxes[p, 2], row), min(boxes[p, 3], row_end)):
-                    dy = pixel_centre(v, height, short) - y
-                    for u in range(boxes[p, 0], boxes[p, 1]):
-                        dx = columns[u] - x
-                        d = dx * dx + dy * dy
-                        k = counts[v - row, u]
-                        if d < limit and k < layers:
-                            idx[n, v, u, k], zbuf[n, v, u, k], dists[n, v, u, k] = p, z, d
-                            counts[v - row, u] = k + 1
-            for v in range(row, row_end):
-                for u in range(width):
-                    for k in range(counts[v - row, u], layers):
-                        idx[n, v, u, k], zbuf[n, v, u, k], dists[n, v, u, k] = -1, -ONE, -ONE
+                _append(points, radius, boxes, p, row, row_end, height, layers, columns, counts, slots)
+            for pixel in range((row_end - row) * width):
+                for slot in range(pixel * layers + counts[pixel], (pixel + 1) * layers):
+                    slots[0][slot] = -1
+                    slots[1][slot] = -ONE
+                    slots[2][slot] = -ONE
+
+
+@inlined_kernel
+def _append(points, radius, boxes, p, row, row_end, height, layers, columns, counts, slots):
+    """Put point p behind what the pixels of a band [row, row_end) have already seen."""
+    idx, zbuf, dists = slots
+    width = len(columns) - BLOCK
+    short = min(height, width)
+    x, y, z, limit = points[p, 0], points[p, 1], points[p, 2], radius[p] * radius[p]
+    begin, end = boxes[p, 0], boxes[p, 1]
+    for v in range(max(boxes[p, 2], row), min(boxes[p, 3], row_end)):
+        dy = pixel_centre(v, height, short) - y
+        first = (v - row) * width
+        for u in range(begin, end):
+            dx = columns[u] - x
+            d = dx * dx + dy * dy
+            k = counts[first + u]
+            if d < limit and k < layers:
+                slot = (first + u) * layers + k
+                idx[slot] = p
+                zbuf[slot] = z
+                dists[slot] = d
+                counts[first + u] = k + 1
 
 
 def backward(
