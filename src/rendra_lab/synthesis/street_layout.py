@@ -125,6 +125,8 @@ def _lay_ground(site: _Site, marks: RoadMarks, sides: list[_Side]) -> None:
     corners = [(-half, 0.0, _BEGIN), (half, 0.0, _BEGIN), (half, 0.0, _END), (-half, 0.0, _END)]
     v = [(z - _BEGIN) / marks.period for _, _, z in corners]
     site.add(parts.quads([corners], list(zip((0, 1, 1, 0), v, strict=True)), TEXTURE["asphalt"]))
+    # what shows where a ray slips between two triangles
+    site.add(parts.ground_strip((-_FAR, _FAR), -0.05, (_BEGIN, _FAR), "verge", 9.0))
     for side in sides:
         s = side.sign
         edge = side.facade - side.depth

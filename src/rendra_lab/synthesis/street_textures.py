@@ -215,13 +215,13 @@ def car_side(rng: Rng, van: bool) -> Array:
     _paint(texture, (0, 1), (sill, 1.0), (0.16, 0.16, 0.17))
     dark = (0.2, 0.22, 0.25)
     windows = [(0.52, 0.64), (0.66, 0.76)] if van else [(0.1, 0.22), (0.245, 0.43), (0.455, 0.68)]
-    for x in windows:
-        _paint(texture, x, (0.1, 0.36) if van else (0.1, 0.38), dark)
-        _paint(texture, x, (0.1, 0.2), (0.36, 0.4, 0.45))
-    for x in (0.44, 0.68, 0.24):
-        texture[round(0.38 * SIDE) : round(sill * SIDE), round(x * SIDE), :3] *= 0.55
-    for x in (0.27, 0.47):
-        _paint(texture, (x, x + 0.04), (0.45, 0.475), (0.15, 0.15, 0.15))
+    for window in windows:
+        _paint(texture, window, (0.1, 0.36) if van else (0.1, 0.38), dark)
+        _paint(texture, window, (0.1, 0.2), (0.36, 0.4, 0.45))
+    for seam in (0.44, 0.68, 0.24):
+        texture[round(0.38 * SIDE) : round(sill * SIDE), round(seam * SIDE), :3] *= 0.55
+    for handle in (0.27, 0.47):
+        _paint(texture, (handle, handle + 0.04), (0.45, 0.475), (0.15, 0.15, 0.15))
     texture[round(0.6 * SIDE) : round(0.63 * SIDE), :, :3] *= 0.85
     _paint(texture, (0.0, 0.02), (0.42, 0.56), (0.7, 0.1, 0.08))
     _paint(texture, (0.975, 1.0), (0.5, 0.6), (0.9, 0.9, 0.85))

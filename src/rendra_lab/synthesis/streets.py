@@ -6,13 +6,15 @@ of 1241 x 376 pixels, focal length 718.856 px, 1.65 m above the road, ten a seco
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
-from rendra_lab.settings import Positive, Size, check_numbers
+from rendra_lab.settings import Positive, check_numbers
 from rendra_lab.synthesis.posed_views import PosedViews
 from rendra_lab.synthesis.street_layout import build_street
 from rendra_lab.synthesis.street_textures import Rng, draw_textures
@@ -36,13 +38,14 @@ class StreetWorld:
         UserError: an impossible setting.
     """
 
-    def __init__(self, max_offset: Positive = 5, step_m: tuple[Size, Size] = (0.8, 1.2)) -> None:
+    def __init__(self, max_offset: Positive = 5, step_m: Sequence[float] = (0.8, 1.2)) -> None:
         check_numbers("data.world", Positive, max_offset=max_offset)
-        low, high = step_m
-        if not 0 < low <= high <= 5:
-            raise UserError(f"data.world.step_m must be [least,most] metres, above 0 and at most 5, got {step_m}")
+        if len(step_m) != 2 or not 0 < step_m[0] <= step_m[1] <= 5:
+            raise UserError(
+                f"data.world.step_m must be [least,most] metres, above 0 and at most 5, got {list(step_m)}"
+            )
         self.max_offset = max_offset
-        self.step_m = (float(low), float(high))
+        self.step_m = (float(step_m[0]), float(step_m[1]))
 
     def settings(self) -> tuple[object, ...]:
         """See `World`."""
