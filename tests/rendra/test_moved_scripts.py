@@ -19,10 +19,12 @@ from rendra.io import IO, load_obj, load_objs_as_meshes, load_ply, save_obj, sav
 from rendra.loss import chamfer_distance, mesh_edge_loss, mesh_laplacian_smoothing, mesh_normal_consistency
 from rendra.ops import interpolate_face_attributes, sample_points_from_meshes
 from rendra.renderer import (
+    AlphaCompositor,
     AmbientLights,
     BlendParams,
     DirectionalLights,
     EmissionAbsorptionRaymarcher,
+    FoVOrthographicCameras,
     FoVPerspectiveCameras,
     HardPhongShader,
     Materials,
@@ -30,9 +32,13 @@ from rendra.renderer import (
     MeshRenderer,
     MeshRendererWithFragments,
     NDCGridRaysampler,
+    NormWeightedCompositor,
     OrthographicCameras,
     PerspectiveCameras,
     PointLights,
+    PointsRasterizationSettings,
+    PointsRasterizer,
+    PointsRenderer,
     RasterizationSettings,
     SfMPerspectiveCameras,
     SoftPhongShader,
@@ -41,6 +47,7 @@ from rendra.renderer import (
     TexturesVertex,
     VolumeRenderer,
     VolumeSampler,
+    compositing,
     hard_rgb_blend,
     look_at_rotation,
     look_at_view_transform,
@@ -49,7 +56,8 @@ from rendra.renderer import (
 from rendra.renderer.cameras import get_world_to_view_transform
 from rendra.renderer.mesh.rasterize_meshes import pix_to_non_square_ndc
 from rendra.renderer.mesh.shader import ShaderBase
-from rendra.structures import Meshes, Volumes, join_meshes_as_batch, join_meshes_as_scene
+from rendra.renderer.points import rasterize_points
+from rendra.structures import Meshes, Pointclouds, Volumes, join_meshes_as_batch, join_meshes_as_scene
 from rendra.transforms import (
     RotateAxisAngle,
     Transform3d,
@@ -755,3 +763,39 @@ def test_volume_render():
     R = so3_exp_map(torch.tensor([[0.0, 0.7, 0.0]]))
     turned = volume_model(FoVPerspectiveCameras(R=R, T=torch.tensor([[0.0, 0.0, 2.7]]), device=device))
     assert ((turned[0, ..., 3] > 0.5) == (target_silhouettes[0] > 0.5)).float().mean() > 0.97
+
+
+def colored_ball(size: int = 4000) -> Pointclouds:
+    verts = torch.nn.functional.normalize(torch.randn(size, 3), dim=1)
+    return Pointclouds(points=[verts], features=[verts * 0.5 + 0.5])
+
+
+@pytest.mark.parametrize("compositor", [AlphaCompositor, NormWeightedCompositor])
+def test_colored_points_are_rendered(compositor: type) -> None:
+    point_cloud = colored_ball()
+    R, T = look_at_view_transform(20, 10, 0)
+    cameras = FoVOrthographicCameras(R=R, T=T, znear=0.01)
+    raster_settings = PointsRasterizationSettings(image_size=64, radius=0.08, points_per_pixel=4)
+    rasterizer = PointsRasterizer(cameras=cameras, raster_settings=raster_settings)
+    renderer = PointsRenderer(rasterizer=rasterizer, compositor=compositor(background_color=(0, 0, 1)))
+    images = renderer(point_cloud)
+    assert images.shape == (1, 64, 64, 3)
+    assert_close(images[0, 0, 0], [0.0, 0.0, 1.0])
+    nearest = cameras.get_camera_center()[0] / 20 * 0.5 + 0.5
+    assert_close(images[0, 28:36, 28:36].mean((0, 1)), nearest, atol=0.1)
+
+
+def test_features_are_splatted_by_hand() -> None:
+    """How view synthesis by point clouds uses the parts: rasterise, weigh by distance, composite."""
+    size, radius, tau = 32, 4.0 / 32 * 2.0, 1.0
+    points = torch.rand(2, 500, 3) * 2 - torch.tensor([1.0, 1.0, -1.0])
+    features = torch.rand(2, 500, 16, requires_grad=True)
+    pts3d = Pointclouds(points=points, features=features)
+    points_idx, _, dist = rasterize_points(pts3d, size, radius, 64)
+    dist = dist / pow(radius, 2)
+    alphas = (1 - dist.clamp(max=1, min=1e-3).pow(0.5)).pow(tau).permute(0, 3, 1, 2)
+    src = pts3d.features_packed().permute(1, 0)
+    for function in (compositing.alpha_composite, compositing.norm_weighted_sum, compositing.weighted_sum):
+        splatted = function(points_idx.permute(0, 3, 1, 2).long(), alphas, src)
+        assert splatted.shape == (2, 16, size, size)
+        assert_finite(torch.autograd.grad(splatted.sum(), features, retain_graph=True)[0])
