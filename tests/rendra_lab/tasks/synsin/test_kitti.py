@@ -1,6 +1,7 @@
 """KITTI's odometry folders: the right cameras, pairs a few frames apart, and complaints that name file and line."""
 
 import json
+import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -80,6 +81,26 @@ def test_batches(tmp_path: Path) -> None:
     assert batches[0].input.shape == (2, 3, *SIZE)
     assert batches[0].truth is None
     assert sum(len(batch.input) for batch in data.test_dataloader()) == 3
+
+
+def test_a_resumed_epoch_draws_what_the_whole_one_drew(tmp_path: Path) -> None:
+    kitti_folder(tmp_path, {"00": 8, "08": 2, "09": 2})
+    whole = list(made(tmp_path, seed=5).train_dataloader())
+    first, rest = made(tmp_path, seed=5).train_dataloader(), made(tmp_path, seed=5).train_dataloader()
+    torch.rand(7)  # a fit draws too
+    beginning = iter(first)
+    batches = [next(beginning)]
+    rest.load_state_dict(first.state_dict())
+    batches += list(rest)
+    assert len(batches) == len(whole) == 4
+    for one, other in zip(batches, whole, strict=True):
+        torch.testing.assert_close(one.target, other.target, rtol=0, atol=0)
+        torch.testing.assert_close(one.input_to_target, other.input_to_target, rtol=0, atol=0)
+
+
+def test_workers_get_all_of_it(tmp_path: Path) -> None:
+    train = pickle.loads(pickle.dumps(made(kitti_folder(tmp_path)).splits.train))
+    assert train[0].input.shape == (1, 3, *SIZE)
 
 
 def test_the_lists_follow_from_the_seed(tmp_path: Path) -> None:
