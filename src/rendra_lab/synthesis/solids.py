@@ -99,11 +99,11 @@ def box(
         cell: the largest side of the quadrilaterals into which its sides are cut.
         grain: axis along which the material's first coordinate runs; None for the longest.
     """
-    half = np.array(size, np.float32) / 2
+    half: Floats = np.array(size, np.float32) / np.float32(2)
     cells = tuple(max(1, min(64, math.ceil(side / cell - 1e-4))) for side in size)
     along = int(np.argmax(half)) if grain is None else grain
     points, normals, faces, sides = _box_lattice(cells)
-    points = points * half
+    points = (points * half).astype(np.float32)
     shift = (abs(center[0]) + 3.7 * abs(center[1]) + 7.3 * abs(center[2])) % 1.0  # two boards differ
     return Solid(
         points=points + np.array(center, np.float32),
@@ -126,7 +126,7 @@ def rounded_box(size: Triple, center: Triple, radius: float, surface: str, color
         color: of it.
         puff: how much the middle of top and bottom swells, metres.
     """
-    half = np.array(size, np.float32) / 2
+    half: Floats = np.array(size, np.float32) / np.float32(2)
     radius = min(radius, 0.999 * float(half.min()))
     inner = half - np.float32(radius)
     unit, _, faces, sides = _box_lattice((6, 6, 6))
