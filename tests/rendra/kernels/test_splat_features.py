@@ -52,24 +52,22 @@ def assert_alike(fast, slow, tolerance=2e-5):
 
 
 @pytest.mark.parametrize("mode", ACCUMULATIONS)
-@pytest.mark.parametrize("size", [(33, 41), (1, 1), (7, 70)])
 @pytest.mark.parametrize(
     "settings",
     [
         {},
+        {"size": (1, 1)},
+        {"size": (7, 70)},
         {"radius": 0.4},
         {"radius": 15.3, "most": 500},
-        {"most": 3},
-        {"tau": 2.0},
-        {"stop_below": 0.0},
-        {"near": 4.0},
+        {"most": 3, "stop_below": 0.0},
+        {"tau": 2.0, "near": 4.0},
     ],
 )
-def test_value_and_gradient_agree_with_the_reference_in_float64(mode, size, settings):
-    cloud = with_monsters(*clouds(size=size))
+def test_value_and_gradient_agree_with_the_reference_in_float64(mode, settings):
+    cloud = with_monsters(*clouds(size=settings.get("size", (33, 41))))
     fast, slow = (
-        values_and_gradients(cloud, dtype, mode=mode, size=size, **settings)
-        for dtype in (torch.float32, torch.float64)
+        values_and_gradients(cloud, dtype, mode=mode, **settings) for dtype in (torch.float32, torch.float64)
     )
     assert_alike(fast, slow)
 
@@ -174,6 +172,15 @@ def test_depths_have_no_slope_and_the_nearest_point_no_place():
     image, _ = splat((points.requires_grad_(), depths, features), "naive")
     image.square().sum().backward()
     assert (points.grad == 0).all()
+
+
+@pytest.mark.parametrize("mode", ACCUMULATIONS)
+def test_discs_far_larger_than_any_picture(mode):
+    """All points weigh about the same at every pixel."""
+    points, depths, features = clouds(20)
+    image, opacity = splat((points, 1 + depths.abs(), features), mode, radius=1e30, stop_below=0.0)
+    assert_close(image, image[..., :1, :1].expand_as(image))
+    assert_close(opacity, torch.ones_like(opacity))
 
 
 def test_features_alone_ask_for_the_same():

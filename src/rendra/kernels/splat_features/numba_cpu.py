@@ -27,6 +27,7 @@ LEAST = np.float32(1e-4)  # of a sum of weights that is divided by
 _ROWS, _COLUMNS = 8, 16  # of a tile
 _PIXELS = _ROWS * _COLUMNS
 _HALF = np.float32(0.5)
+_FARTHEST = 1e18  # pixels; discs beyond are as large: squares and numbers of pixels stay finite
 
 
 class Settings(NamedTuple):
@@ -45,7 +46,9 @@ def settings_of(
     height: int, width: int, radius: float, most: int, mode: int, tau: float, stop_below: float
 ) -> Settings:
     """Numbers as kernels read them."""
-    return Settings(height, width, np.float32(radius), most, mode, np.float32(tau), np.float32(stop_below))
+    return Settings(
+        height, width, np.float32(min(radius, _FARTHEST)), most, mode, np.float32(tau), np.float32(stop_below)
+    )
 
 
 def forward(
