@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from rendra.kernels.parallel import parallel_kernel
 from rendra_lab.synthesis.solids import Floats
 
 _LIFT = np.float32(0.01)  # metres that corners are lifted off their surface, so that it does not hide them
@@ -22,6 +21,7 @@ _UPWARDS = np.float32(0.35)  # share of its light that a lamp's shade lets throu
 _SOFT = np.float32(0.15)  # added to squared distances: lamps are no points
 _DARKEST = np.float32(0.85)  # share of the light from all sides that what touches a point takes
 _BURIED = np.float32(0.3)  # share of it that is left to a wall or floor within furniture
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-6)
 
 
@@ -56,9 +56,13 @@ class Blockers:
 
     def hold(self, points: Floats, margin: float = 0.0) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Whether points (N, 3) lie in a box, or nearer to it than a margin along each of its axes: (N,)."""
-        points = np.ascontiguousarray(points, np.float32)
         held = np.zeros(len(points), np.bool_)
-        _hold(points, np.float32(margin), self.boxes, self.first, self.frames, held)
+        for (cos, sin, *place), first, last in zip(self.frames, self.first[:-1], self.first[1:], strict=True):
+            x, y, z = (points - np.array(place, np.float32)).T
+            own = np.stack([cos * x - sin * z, y, sin * x + cos * z], 1)[:, None]
+            boxes = self.boxes[first:last]
+            is_in = (own > boxes[:, :3] - margin) & (own < boxes[:, 3:] + margin)
+            held |= np.any(is_in.all(-1), axis=1)
         return held
 
 
@@ -99,7 +103,8 @@ def openness(
     """
     share = np.empty(len(points), np.float32)
     parts = (blockers.boxes, blockers.first, blockers.bounds, blockers.frames)
-    _open(points, normals, num_shell, np.array(room, np.float32), _directions(), parts, share)
+    _open(points, normals, np.array(room, np.float32), _directions(), parts, share)
+    share[:num_shell][blockers.hold((points + _LIFT * normals)[:num_shell])] = _BURIED
     return share
 
 
@@ -113,19 +118,19 @@ def _directions() -> Floats:
     return np.ascontiguousarray(np.concatenate([axes, signs]) @ turn @ tip, np.float32)
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@_compiled
 def _own(frame, x, y, z):  # type: ignore[no-untyped-def]
     """A vector of the room in the axes of a group."""
     return frame[0] * x - frame[1] * z, y, frame[1] * x + frame[0] * z
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@_compiled
 def _over(value):  # type: ignore[no-untyped-def]
     """1 / value, finite."""
     return _ONE / (value if abs(value) > _TINY else _TINY)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_compiled
 def _crossed(box, x, y, z, over_x, over_y, over_z):  # type: ignore[no-untyped-def]
     """When a ray enters a box and when it leaves it, in units of its way."""
     near, far = (box[0] - x) * over_x, (box[3] - x) * over_x
@@ -136,7 +141,7 @@ def _crossed(box, x, y, z, over_x, over_y, over_z):  # type: ignore[no-untyped-d
     return max(entry, min(near, far)), min(leave, max(near, far))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_compiled
 def _entry(x, y, z, way_x, way_y, way_z, first_hit, parts):  # type: ignore[no-untyped-def]
     """When a ray first enters a box, at most `_ONE`; where any hit will do, when it enters one of them."""
     boxes, first, bounds, frames = parts
@@ -158,10 +163,10 @@ def _entry(x, y, z, way_x, way_y, way_z, first_hit, parts):  # type: ignore[no-u
     return nearest
 
 
-@parallel_kernel
+@_compiled
 def _light(points, normals, lights, parts, direct):  # type: ignore[no-untyped-def]
     places, colors, aheads = lights
-    for corner in numba.prange(len(points)):
+    for corner in range(len(points)):
         nx, ny, nz = normals[corner, 0], normals[corner, 1], normals[corner, 2]
         x, y, z = points[corner, 0] + _LIFT * nx, points[corner, 1] + _LIFT * ny, points[corner, 2] + _LIFT * nz
         red, green, blue = _ZERO, _ZERO, _ZERO
@@ -182,9 +187,9 @@ def _light(points, normals, lights, parts, direct):  # type: ignore[no-untyped-d
         direct[corner, 0], direct[corner, 1], direct[corner, 2] = red, green, blue
 
 
-@parallel_kernel
-def _open(points, normals, num_shell, room, directions, parts, share):  # type: ignore[no-untyped-def]
-    for corner in numba.prange(len(points)):
+@_compiled
+def _open(points, normals, room, directions, parts, share):  # type: ignore[no-untyped-def]
+    for corner in range(len(points)):
         nx, ny, nz = normals[corner, 0], normals[corner, 1], normals[corner, 2]
         x, y, z = points[corner, 0] + _LIFT * nx, points[corner, 1] + _LIFT * ny, points[corner, 2] + _LIFT * nz
         hidden, whole = _ZERO, _TINY
@@ -201,27 +206,3 @@ def _open(points, normals, num_shell, room, directions, parts, share):  # type: 
             hidden += weight * (_ONE - min(entry, min(leave, _ONE)))
             whole += weight
         share[corner] = _ONE - _DARKEST * hidden / whole
-        if corner < num_shell and _is_held(x, y, z, _ZERO, parts[0], parts[1], parts[3]):
-            share[corner] = _BURIED
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _is_held(x, y, z, margin, boxes, first, frames):  # type: ignore[no-untyped-def]
-    for group in range(len(frames)):
-        frame = frames[group]
-        own_x, own_y, own_z = _own(frame, x - frame[2], y - frame[3], z - frame[4])
-        for row in range(first[group], first[group + 1]):
-            box = boxes[row]
-            if (
-                box[0] - margin < own_x < box[3] + margin
-                and box[1] - margin < own_y < box[4] + margin
-                and box[2] - margin < own_z < box[5] + margin
-            ):
-                return True
-    return False
-
-
-@parallel_kernel
-def _hold(points, margin, boxes, first, frames, held):  # type: ignore[no-untyped-def]
-    for row in numba.prange(len(points)):
-        held[row] = _is_held(points[row, 0], points[row, 1], points[row, 2], margin, boxes, first, frames)
