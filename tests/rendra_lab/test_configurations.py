@@ -22,7 +22,6 @@ _OF_VOLUMES = {
     "book": ("volume.voxels=8", "volume.samples=6", "module.refine_at=[]"),
     "grid": ("volume.voxels=[6,8]", "module.refine_at=[1]"),
 }
-_OF_TASKS = {"nerf": _SMALL_SCENE, "volume": (*_SMALL_SCENE, *_OF_VOLUMES["grid"])}
 _FEW_PEOPLE = (
     "data.count=3",
     "data.image_size=64",
@@ -30,6 +29,20 @@ _FEW_PEOPLE = (
     "module.shown=1",
     "callbacks.people.pictures=1",
 )
+_FEW_PAIRS = (
+    "data.image_size=64",
+    "data.counts=[1,1,1]",
+    "data.views_per_scene=2",
+    "data.batch_size=2",
+    "data.cache=null",
+    "callbacks.pairs.pictures=1",
+)
+_OF_TASKS = {
+    "nerf": _SMALL_SCENE,
+    "volume": (*_SMALL_SCENE, *_OF_VOLUMES["grid"]),
+    "smplify": _FEW_PEOPLE,
+    "synsin": _FEW_PAIRS,
+}
 _OF_FIELDS = {
     "hash_grid": ("field.encoding.log2_table_size=8", "field.width=8"),
     "tri_plane": ("field.encoding.resolutions=[4,8]", "field.width=8"),
@@ -61,9 +74,7 @@ def one_step(compose: Callable[..., Any], folder: Path, *overrides: str) -> dict
 
 @pytest.mark.parametrize("task", names("task"))
 def test_every_task_makes_a_step(task: str, compose: Callable[..., Any], tmp_path: Path) -> None:
-    record = one_step(
-        compose, tmp_path / task / "run", f"task={task}", *{**_OF_TASKS, "smplify": _FEW_PEOPLE}.get(task, ())
-    )
+    record = one_step(compose, tmp_path / task / "run", f"task={task}", *_OF_TASKS.get(task, ()))
     assert record["steps"] >= 1
     assert record["metrics"]
 
@@ -126,7 +137,7 @@ def test_every_folder_of_a_scene_is_read_and_fitted(
 
 
 @pytest.mark.parametrize("scene_report", names("scene_report"))
-@pytest.mark.parametrize("task", sorted(set(names("task")) & set(_OF_TASKS)))
+@pytest.mark.parametrize("task", sorted(set(names("task")) & {"nerf", "volume"}))
 def test_every_report_of_a_scene_stands_alone(
     task: str, scene_report: str, compose: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -146,7 +157,7 @@ def test_every_experiment_makes_a_step_and_says_how(
     lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[0] == "# @package _global_"
     assert f"python train.py experiment={experiment}" in lines[1]
-    few = _FEW_PEOPLE if experiment.startswith("smplify") else ()
+    few = {"smplify": _FEW_PEOPLE, "synsin": _FEW_PAIRS}.get(experiment.partition("_")[0], ())
     settings = (f"experiment={experiment}", *SMALLER.get(experiment, few))
     assert one_step(compose, tmp_path / "experiment" / "run", *settings)["steps"] >= 1
 

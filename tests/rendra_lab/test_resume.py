@@ -48,6 +48,8 @@ SMALLER = {
     "volume": (*_SCENE, *_VOLUME),
     "pose_track": ("data.frames=4", "data.steps_per_frame=3", *_SMALL_MESH),
     "pose": _SMALL_MESH,
+    "smplify": ("data.count=4", "data.image_size=64", "data.cache=null", "module.narrow=[[3,2]]"),
+    "synsin": ("data.image_size=64", "data.counts=[2,1,1]", "data.batch_size=4", "data.cache=null"),
     "toy": ("+data.steps=5", "trainer.val_check_interval=1.0"),
 }
 VARIANTS = {
