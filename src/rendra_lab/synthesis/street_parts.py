@@ -116,7 +116,7 @@ _VAN = _CarKind(
     (
         (0, 0.3),
         (0, 0.7),
-        (0, 1.3),
+        (0, 1.25),
         (0.02, 2.02),
         (0.5, 2.1),
         (0.7, 2.0),
@@ -354,13 +354,13 @@ def _roof(rng: Rng, plan: HousePlan, top: float, blank: int) -> PaintedFaces:
     if plan.roof == "gable":
         ends = [(middle_x, ridge, z0), (middle_x, ridge, z1)]
         eaves_lines = [[(x, top - drop, z0), (x, top - drop, z1)] for x in (front - out * eaves, back + out * eaves)]
-        gables = [[(front, top, z), (back, top, z), (middle_x, ridge - 0.03, z)] for z in (z0, z1)]
+        gables = [[(front, top, z), (back, top, z), (middle_x, ridge, z)] for z in (z0, z1)]
     else:
         ends = [(front - out * eaves, ridge, middle_z), (back, ridge, middle_z)]
         eaves_lines = [
             [(front - out * eaves, top - drop, z), (back, top - drop, z)] for z in (z0 - eaves, z1 + eaves)
         ]
-        gables = [[(x, top, z0), (x, top, z1), (x, ridge - 0.03, middle_z)] for x in (front, back)]
+        gables = [[(x, top, z0), (x, top, z1), (x, ridge, middle_z)] for x in (front, back)]
     long = float(np.linalg.norm(np.subtract(ends[1], ends[0]))) / 3
     slopes = [[ends[0], ends[1], line[1], line[0]] for line in eaves_lines]
     roof = quads(slopes, [(0, 0), (long, 0), (long, half / 2), (0, half / 2)], texture, tint)

@@ -6,12 +6,18 @@ import torch
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
+from rendra_lab.synthesis import street_parts
+from rendra_lab.synthesis.painted_faces import PaintedFaces, quads
 from rendra_lab.synthesis.posed_views import PosedViews, seen_by, to_other_view
 from rendra_lab.synthesis.street_layout import build_street
 from rendra_lab.synthesis.street_textures import NAMES, SIDE, RoadMarks, draw_textures
 from rendra_lab.synthesis.streets import StreetWorld, kitti_intrinsics
+from rendra_lab.synthesis.sunlit_scenes import ContactShade, Daylight, SunlitScene
 
 SIZE = (96, 96)
+OPEN = ContactShade(np.ones((2, 2), np.float32), (0.0, 0.0), 1.0)
+GREY = (0.5, 0.5, 0.5)
+DULL = Daylight((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), GREY, GREY, GREY, 1e6, torch.ones(3, 2, 2))
 
 
 @pytest.fixture(scope="module")
@@ -135,3 +141,18 @@ def test_impossible_settings(settings: dict, message: str) -> None:
 def test_more_views_than_frames() -> None:
     with pytest.raises(UserError, match="leaves 3 frames to choose from; got 4 views"):
         StreetWorld(max_offset=2).views(0, 4, (16, 16))
+
+
+def test_cars_have_no_gaps_in_their_sides() -> None:
+    """Seen from behind and aside, nothing of what stands beyond shows through a car of each kind."""
+    for number in range(len(street_parts._CAR_KINDS)):
+        body = street_parts._car(number)
+        beyond = quads([[(-9, 9, 9), (9, 9, 9), (9, -9, 9), (-9, -9, 9)]], [(0, 0)] * 4, 0)
+        faces = PaintedFaces.joined([body.placed((-0.8, -1.2, 4.5), 0.35), beyond])
+        scene = SunlitScene(faces, torch.ones(64, 2, 2, 4), DULL, OPEN)
+        _, depth = scene.take(torch.tensor([[300.0, 0, 128], [0, 300, 128], [0, 0, 1]]), torch.eye(4), (256, 256))
+        is_car = (depth < 8.9)[None].float()
+        closed = -torch.nn.functional.max_pool2d(-torch.nn.functional.max_pool2d(is_car, 5, 1, 2), 5, 1, 2)
+        slits = (closed - is_car)[0, 0, : 128 + 40]  # higher than the wheels
+        assert int(is_car.sum()) > 8000
+        assert int(slits.sum()) <= 6, number  # notches of the outline
