@@ -18,8 +18,10 @@ from rendra_lab import metrics
 from rendra_lab.base_task import BaseTask
 from rendra_lab.errors import UserError
 from rendra_lab.networks import efficientnet_lite
+from rendra_lab.synthesis.posed_views import PosedViews
 from rendra_lab.tasks.synsin import pair_table, scores
 from rendra_lab.tasks.synsin.baselines import baselines
+from rendra_lab.tasks.synsin.generated_pairs import GeneratedPairs
 from rendra_lab.tasks.synsin.pair_data import PairData, PairSplits, joined
 from rendra_lab.tasks.synsin.pair_table import formatted, means_of, numbers_of, results
 from rendra_lab.tasks.synsin.records import PairBatch, PairTruth, ViewPrediction
@@ -217,3 +219,30 @@ def test_baselines_are_those_whose_depth_is_known() -> None:
     batch = wall_pair(0)
     assert list(baselines(batch, 3.0)) == ["copy", "true_warp", "constant_warp"]
     assert list(baselines(replace(batch, truth=None), None)) == ["copy"]
+
+
+class Flats:
+    """Places of one depth each, 3, 4, 5 ... metres, under a sky that fills three quarters of the pictures."""
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def settings(self) -> tuple[object, ...]:
+        return ()
+
+    def views(self, seed: int, count: int, size: tuple[int, int]) -> PosedViews:
+        depth = torch.full((count, 1, *size), torch.inf)
+        depth[..., : size[0] // 4, :] = 3.0 + self.made
+        self.made += 1
+        lens = torch.eye(3).expand(count, 3, 3).contiguous()
+        return PosedViews(
+            torch.zeros(count, 3, *size, dtype=torch.uint8), depth, lens, torch.eye(4).repeat(count, 1, 1)
+        )
+
+
+def test_the_typical_depth_is_that_of_the_training_places_without_their_sky() -> None:
+    assert GeneratedPairs(Flats(), image_size=8, counts=(3, 2, 2)).typical_depth() == 4.0
+    skies = GeneratedPairs(Flats(), image_size=8, counts=(1, 0, 0))
+    skies.setup("test")
+    skies.splits.train.places[0].depth.fill_(torch.inf)  # type: ignore[attr-defined]
+    assert skies.typical_depth() is None
