@@ -47,6 +47,7 @@ _IDLE_WARNINGS = (
     r".*you defined a `validation_step` but have no `val_dataloader`.*",
     r"The dirpath has changed from.*",
     r".*LeafSpec.*is deprecated.*",
+    r"Using ModelCheckpoint with manual optimization.*",  # it warns of what we want: the state after the step
     r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint.*",
 )
 
