@@ -43,7 +43,8 @@ def _picture_of_mesh(cfg: Any, folder: Path) -> tuple[str, Path]:
     kind = pictures.kind_of_picture(cfg.gallery, cfg.turntable, cfg.transparent)
     output = Path(cfg.output) if cfg.output else folder / pictures.FILE_NAMES[kind]
     mesh = instantiate(cfg.mesh, device=cfg.device, _convert_="all")
-    return pictures.draw(kind, studio, mesh, output, 36 if cfg.frames is None else cfg.frames, cfg.fps), output
+    frames, fps = (36 if cfg.frames is None else cfg.frames), (18.0 if cfg.fps is None else cfg.fps)
+    return pictures.draw(kind, studio, mesh, output, frames, fps), output
 
 
 def _film_of_run(cfg: Any, folder: Path) -> tuple[str, Path]:

@@ -23,6 +23,8 @@ def main(cfg: Any) -> None:
     from rendra_lab.errors import UserError
 
     folder = Path(cfg.output) if cfg.output else Path(HydraConfig.get().runtime.output_dir)
+    if folder.suffix and not folder.is_dir():
+        raise UserError(f"output is a folder for picture, numbers and meshes; {folder} looks like a file")
     kind, sheets = pictures.kind_of_picture(False, cfg.turntable, False), list(sheets_of(cfg.sheet))
     if unknown := sorted(set(map(str, cfg.meshes)) - set(FORMATS)):
         raise UserError(f"meshes must be some of {', '.join(FORMATS)}, got {', '.join(unknown)}")

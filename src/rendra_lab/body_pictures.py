@@ -35,6 +35,7 @@ _ARMS_DOWN = 1.0  # radians; so that bodies stand close together
 _AZIMUTH, _ELEVATION = 25.0, 5.0  # degrees; of sheets
 _MARGIN = 1.05  # about what a sheet shows
 _MOST_BYTES = 2**24  # of a file of poses
+_FIT_KEY = "center_px"  # which a file of fits has beside its poses
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def random_numbers(body: SMPL, seed: int, pose_spread: float = 0.2, beta_spread:
     return BodyNumbers(_row(pose, body).reshape(1, -1, 3), _row(betas, body))
 
 
-def read_numbers(body: SMPL, path: str | Path, index: int = 0, camera_axes: bool = False) -> BodyNumbers:
+def read_numbers(body: SMPL, path: str | Path, index: int = 0, camera_axes: bool | None = None) -> BodyNumbers:
     """A pose, and betas where there are any, from `.json`, `.npz` or a pickle of arrays; nothing in it is executed.
 
     Args:
@@ -82,7 +83,8 @@ def read_numbers(body: SMPL, path: str | Path, index: int = 0, camera_axes: bool
         path: a dictionary with `pose`, (3 J,), (J, 3) or rows of such, radians; in JSON also {joint: [x, y, z]}, the
             others at rest. `betas` likewise, the mean shape without.
         index: of the row, where there are several.
-        camera_axes: the first rotation turns into axes with y down and z forwards, as SMPLify's does.
+        camera_axes: the first rotation turns into axes with y down and z forwards. None: so it does in the files of
+            task=smplify, which say where the camera's centre is, and in no others.
 
     Raises:
         UserError: no such file, none of these, or numbers that do not fit the body; says which.
@@ -99,7 +101,7 @@ def read_numbers(body: SMPL, path: str | Path, index: int = 0, camera_axes: bool
     if len(betas) > body.num_betas:
         raise UserError(f"{path} has {len(betas)} betas, and the body {body.num_betas}")
     found = BodyNumbers(_row(pose, body).reshape(1, -1, 3), with_betas(body, betas.tolist()))
-    return _upright(found) if camera_axes else found
+    return _upright(found) if (_FIT_KEY in content if camera_axes is None else camera_axes) else found
 
 
 def with_betas(body: SMPL, betas: Sequence[float]) -> Tensor:

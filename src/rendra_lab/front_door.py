@@ -157,6 +157,8 @@ def explain(error: Exception, config_dir: Path, config_name: str) -> str:
 def _explain_argument(error: Exception, config_dir: Path) -> str | None:
     """One line about an argument that Hydra cannot read or that gives a group no choice; None for other mistakes."""
     if isinstance(error, OverrideParseException):
+        if "=" not in str(error.override):
+            return f"cannot read {error.override!r}: settings are key=value; see --help"
         return f"cannot read {error.override!r}: brackets and quotes come in pairs, as in 'key=[1,2]' 'key=\"a b\"'"
     if "Config group override must be" in str(error):
         for item in sys.argv[1:]:

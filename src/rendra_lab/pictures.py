@@ -263,7 +263,7 @@ def draw(kind: str, studio: Studio, mesh: Meshes, output: Path, frames: int = 36
     """
     what = f"{len(mesh.verts_packed()):,} vertices, {len(mesh.faces_packed()):,} faces"
     if kind in ("gif", "mp4"):
-        if not 0 < fps <= 1000:
+        if not isinstance(fps, int | float) or not 0 < fps <= 1000:
             raise UserError(f"fps must lie above 0, at most 1000, got {fps!r}")
         _demand_writable(kind, output)
         save_animation(output, list(turntable(studio, mesh, frames)), fps, hold_s=0)

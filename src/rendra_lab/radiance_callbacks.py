@@ -71,8 +71,8 @@ class Turntable(Callback):
         shot = shoot(pl_module, data, cameras, self.shown)
         self._write(trainer, shot.films)
         files = ", ".join(f"{_FILES[name]}.gif" for name in shot.films)
-        video = "and .mp4" if can_write_mp4() else "; no .mp4 without the extra [view]"
-        report.say(f"{shot}: {files} {video}")
+        video = " and .mp4" if can_write_mp4() else "; no .mp4 without the extra [view]"
+        report.say(f"{shot}: {files}{video}")
         for logger in trainer.loggers:
             figures = {"film/seconds": shot.seconds, "film/frames_per_s": shot.frames_per_s}
             logger.log_metrics(figures, trainer.global_step)

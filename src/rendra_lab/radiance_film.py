@@ -16,7 +16,7 @@ from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.data.ray_views import RayBatch, RayCaster, SceneViews
 from rendra_lab.errors import UserError
 from rendra_lab.networks.radiance import RadiancePrediction, view_normals
-from rendra_lab.trajectories import Size, trajectory
+from rendra_lab.trajectories import Size, rate_of, trajectory
 from rendra_lab.visualization import (
     Picture,
     can_write_mp4,
@@ -119,7 +119,7 @@ class Shot:
     def __str__(self) -> str:
         """One line for people."""
         height, width = self.size
-        return f"{self.count} frames of {width}x{height} rendered in {self.seconds:.1f} s, {self.frames_per_s:.0f}/s"
+        return f"{self.count} frames of {width}x{height} rendered in {self.seconds:.1f} s, {self.frames_per_s:.1f}/s"
 
 
 def shoot(task: BaseTask[RayBatch, Any], data: SceneViews, cameras: PosedImages, shown: Sequence[str]) -> Shot:
@@ -137,7 +137,7 @@ class FilmOrder:
     Attributes:
         trajectory, frames, size, elevation_deg: see `rendra_lab.trajectories.trajectory`.
         what: one of SHOWN, or all of them side by side.
-        fps: frames a second of a file.
+        fps: frames a second of a file; None: as the way's own file says, else 20.
         output: a .gif or .mp4 file; a folder that exists for a file that is named after what it shows; any other
             path without an ending for a folder of PNG files.
 
@@ -151,12 +151,12 @@ class FilmOrder:
     frames: int | None = None
     size: Size = None
     elevation_deg: float | None = None
-    fps: float = 20.0
+    fps: float | None = None
 
     def __post_init__(self) -> None:
         if self.what not in (*SHOWN, "all"):
             raise UserError(f"what must be {', '.join(SHOWN)} or all, got {self.what!r}")
-        if not self.fps > 0:
+        if self.fps is not None and not (isinstance(self.fps, int | float) and self.fps > 0):
             raise UserError(f"fps must be positive, got {self.fps!r}")
         if self.output.suffix not in ("", ".gif", ".mp4") and not self.output.is_dir():
             raise UserError(f"output must end in .gif or .mp4, or be a folder for PNG files; got {self.output}")
@@ -197,7 +197,7 @@ def render_run(task: Any, data: Any, order: FilmOrder) -> tuple[str, Path]:
     frames = [captioned_row(row) if len(row) > 1 else next(iter(row.values())) for row in rows]
     output = order.file()
     if output.suffix:
-        save_animation(output, frames, order.fps, hold_s=0)
+        save_animation(output, frames, rate_of(order.trajectory) if order.fps is None else order.fps, hold_s=0)
     else:
         for index, frame in enumerate(frames):
             save_picture(output / f"frame_{index:04d}.png", frame)

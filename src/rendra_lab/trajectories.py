@@ -31,6 +31,7 @@ _STEEPEST_DEG = 85.0
 _SAME_WAY = 0.9  # length of the mean of the viewing directions from which on a scene counts as forward-facing
 _PARALLEL = 1e-3  # share of the smallest eigenvalue below which optical axes have no common point
 _MOST_CAMERAS = 100_000
+_FPS = 20.0
 
 
 def trajectory(
@@ -196,6 +197,11 @@ def from_file(path: str | Path, scene: Scene, frames: int | None = None, size: S
     return _unseen(R, position, intrinsics, sizes)
 
 
+def rate_of(name: str) -> float:
+    """Frames a second at which a way is played: what its file says, else 20."""
+    return _read(Path(name))[0].fps if name.endswith(".json") else _FPS
+
+
 @dataclass(frozen=True)
 class _Keyframes:
     """Cameras at certain times."""
@@ -259,7 +265,7 @@ def _read(path: Path) -> tuple[_Keyframes, Mapping[str, Any]]:
         R=torch.stack(R),
         position=torch.stack(position),
         fov=torch.tensor(fov, dtype=torch.float64),
-        fps=_number(tree, "fps", 20.0, 1e-3, 1e3, str(path)),
+        fps=_number(tree, "fps", _FPS, 1e-3, 1e3, str(path)),
         closed=closed,
         size=_size_in(tree, path),
     )

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -221,10 +222,25 @@ def save_animation(path: str | Path, frames: Sequence[Picture], fps: float = 12.
 
 def _save_gif(path: Path, frames: Sequence[Picture], fps: float, hold_s: float) -> None:
     # one palette for all frames: no flicker, and a smaller file
-    palette = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)])).quantize(255)
-    pages = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    durations = [round(1000 / fps)] * (len(pages) - 1) + [round(1000 * max(hold_s, 1 / fps))]
+    sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
+    _, commonest = max(sample.getcolors(sample.width * sample.height))  # type: ignore[arg-type]
+    palette = sample.quantize(254)
+    pages = [_page(frame, palette, commonest) for frame in frames]
+    ends = [round(100 * page / fps) for page in range(len(pages))]  # the format counts hundredths of a second
+    durations = [10 * max(1, end - begin) for begin, end in pairwise(ends)] + [round(1000 * max(hold_s, 1 / fps))]
     pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0, optimize=False)
+
+
+def _page(frame: Picture, palette: Image.Image, exact: Any) -> Image.Image:
+    """In the colours of a palette, and in one more that stays what it is, as a white background does."""
+    page = Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+    colors = page.getpalette()
+    assert colors is not None
+    indices = np.array(page)
+    indices[(frame == exact).all(axis=2)] = len(colors) // 3
+    answer = Image.fromarray(indices)
+    answer.putpalette([*colors, *exact])
+    return answer
 
 
 def _save_mp4(path: Path, frames: Sequence[Picture], fps: float) -> None:

@@ -72,6 +72,14 @@ def test_a_body_in_a_cameras_axes_is_set_upright(body: SMPL, tmp_path: Path) -> 
     torch.testing.assert_close(axis_angle_to_matrix(upright.pose[0, 0]), torch.eye(3), rtol=0, atol=1e-5)
 
 
+def test_a_file_of_fits_is_known_to_be_in_a_cameras_axes(body: SMPL, tmp_path: Path) -> None:
+    rows = {"pose": [[np.pi, *[0.0] * 71]] * 2, "center_px": [[64.0, 64.0]] * 2}
+    (tmp_path / "people.json").write_text(json.dumps(rows))
+    turn = {axes: body_pictures.read_numbers(body, tmp_path / "people.json", 1, axes) for axes in (None, False)}
+    torch.testing.assert_close(axis_angle_to_matrix(turn[None].pose[0, 0]), torch.eye(3), rtol=0, atol=1e-5)
+    assert turn[False].pose[0, 0, 0] == pytest.approx(np.pi)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [

@@ -40,7 +40,8 @@ FAST = {
     # the command line itself
     "task=localize data.paths=[a": "cannot read 'data.paths=[a': brackets and quotes come in pairs",
     'task=localize optimizer.lr="1': "cannot read 'optimizer.lr=\"1'",
-    "optimizer.lr": "cannot read 'optimizer.lr'",
+    "optimizer.lr": "cannot read 'optimizer.lr': settings are key=value",
+    "task nerf": "cannot read 'task': settings are key=value",
     "optimizer.lr=1,2": "Ambiguous value for argument 'optimizer.lr=1,2'",
     "task=localize optimizer.lr=${nothing}": "optimizer.lr: Interpolation key 'nothing' not found",
     "task=localize seed=${threads} threads=${seed}": "Recursive interpolation detected",
@@ -131,6 +132,7 @@ SLOW = {
     "scripts/render.py antialias=0": "antialias must be a whole number from 1 to 8, got 0",
     "scripts/render.py background=purplish": "background must be",
     "scripts/render.py turntable=gif fps=0": "fps must lie above 0, at most 1000, got 0",
+    "scripts/render.py turntable=gif fps=fast": "fps must lie above 0, at most 1000, got 'fast'",
     "scripts/render.py turntable=avi": "turntable must be null, gif or mp4, got 'avi'",
     "scripts/render.py size=16 output=a.xyz": "output must end in .png",
     "scripts/generate_data.py output=o format=abc": "format must be one of",

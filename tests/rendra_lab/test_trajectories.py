@@ -20,6 +20,7 @@ from rendra_lab.trajectories import (
     is_forward_facing,
     orbit,
     point_of_interest,
+    rate_of,
     spiral,
     trajectory,
     upward,
@@ -191,6 +192,8 @@ def test_the_way_between_keyframes_is_smooth_and_even(tmp_path: Path) -> None:
         for i, R in enumerate(turned)
     ]
     path = from_file(write(tmp_path, {"keyframes": keyframes, "fps": 5}), ring_scene())
+    assert rate_of(str(write(tmp_path, {"keyframes": keyframes, "fps": 5}))) == 5
+    assert rate_of("orbit") == 20
     assert len(path) == 31
     share = torch.linspace(0, 1, 31)
     assert_close(path.positions[:, 0], 3 * share, atol=1e-5)

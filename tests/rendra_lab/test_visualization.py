@@ -63,6 +63,21 @@ def test_gifs_hold_every_frame_and_pause_at_the_end(tmp_path: Path) -> None:
     assert np.abs(np.array(shades) - [0, 100, 200]).max() < 8
 
 
+def test_gifs_play_as_fast_as_asked_and_keep_their_background(tmp_path: Path) -> None:
+    frames = [np.full((32, 32, 3), 255, np.uint8) for _ in range(19)]
+    rng = np.random.default_rng(0)
+    for frame in frames:
+        frame[10:20, 10:20] = rng.integers(0, 256, (10, 10, 3))
+        frame[5:9] = rng.integers(248, 255, (4, 32, 1))
+    with Image.open(visualization.save_animation(tmp_path / "film.gif", frames, fps=18, hold_s=0)) as image:
+        lengths = []
+        for index in range(19):
+            image.seek(index)
+            lengths.append(image.info["duration"])
+            assert (np.asarray(image.convert("RGB"))[:5] == 255).all()
+    assert sum(lengths[:18]) == 1000
+
+
 def test_animations_need_frames_and_a_known_ending(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one frame"):
         visualization.save_animation(tmp_path / "fit.gif", [])

@@ -85,7 +85,7 @@ class PeopleReport(Callback):
         for person in people:
             row = portraits.row(prediction, batch, person)
             visualization.save_picture(self.folder / "people" / f"person_{person:04d}.png", row)
-            rows.append(visualization.caption(row, f"{person}: {batch.pictures[person]}"))
+            rows.append(visualization.caption(row, f"{person}: {Path(batch.pictures[person]).name}"))
         if not rows:
             return
         sheet = visualization.tile(rows, columns=1 if len(rows) < 4 else 2)
