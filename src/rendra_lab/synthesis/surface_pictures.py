@@ -23,6 +23,7 @@ from rendra_lab.synthesis.texture_pyramid import TexturePyramid
 GAMMA = 2.2
 _SIDE = 2  # samples of a pixel along each of its sides
 _NEAREST = 0.02  # metres
+_CRACK = 1e-10  # squared NDC: what lies on the edge between two faces belongs to them, not to what is behind
 _CONTRAST = 0.2  # how far tones are drawn apart in the middle
 _GRAZING = 0.06  # cosines below it are taken for it: surfaces seen so flatly would be one colour
 
@@ -153,4 +154,5 @@ def _rasterizer(intrinsics: Tensor, pose: Tensor, size: tuple[int, int]) -> Mesh
         image_size=[size],
         device=pose.device,
     )
-    return MeshRasterizer(cameras, RasterizationSettings(size, z_clip_value=_NEAREST, cull_to_frustum=True))
+    settings = RasterizationSettings(size, blur_radius=_CRACK, z_clip_value=_NEAREST, cull_to_frustum=True)
+    return MeshRasterizer(cameras, settings)
