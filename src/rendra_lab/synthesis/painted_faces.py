@@ -108,8 +108,8 @@ def tube(bottom: npt.ArrayLike, top: npt.ArrayLike, radii: tuple[float, float], 
     """A cone's trunk between two places, without its ends."""
     low, high = np.asarray(bottom, np.float32), np.asarray(top, np.float32)
     along = (high - low) / np.linalg.norm(high - low)
-    across = np.cross(along, (0, 0, 1) if abs(along[2]) < 0.9 else (1, 0, 0))
-    across /= np.linalg.norm(across)
+    across: Array = np.cross(along, (0, 0, 1) if abs(along[2]) < 0.9 else (1, 0, 0))
+    across = across / np.linalg.norm(across)
     other = np.cross(along, across)
     angle = 2 * np.pi * np.arange(sides + 1)[:, None] / sides
     ring = np.cos(angle) * across + np.sin(angle) * other

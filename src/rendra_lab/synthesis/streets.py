@@ -20,7 +20,7 @@ from rendra_lab.synthesis.street_layout import build_street
 from rendra_lab.synthesis.street_textures import Rng, draw_textures
 from rendra_lab.synthesis.sunlit_scenes import Daylight, SunlitScene
 
-_EDITION = 2  # another one makes all cached pictures anew
+_EDITION = 3  # another one makes all cached pictures anew
 _WIDTH, _HEIGHT = 1241.0, 376.0
 _FOCAL, _CENTER = 718.856, (607.1928, 185.2157)  # px, of the sequences 00 to 02
 _CAMERA_M = 1.65  # above the road

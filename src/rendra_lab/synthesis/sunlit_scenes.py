@@ -22,6 +22,7 @@ from rendra_lab.synthesis.ripmaps import Ripmaps
 
 _SAMPLES = 2  # of a pixel along each side
 _NEAREST_M = 0.2
+_SEAM = 1e-10  # squared NDC by which triangles overlap: a ray on the edge of two would hit neither
 _MAP_SIDE = 768  # of the shadow map, texels
 _BIAS_M = 0.12  # how much nearer the sun something must be to throw a shadow
 _OPENCV_TO_RENDRA = torch.tensor([-1.0, -1.0, 1.0])
@@ -140,7 +141,7 @@ class SunlitScene:
             image_size=(size,),
             in_ndc=False,
         )
-        settings = RasterizationSettings(image_size=size, z_clip_value=_NEAREST_M, cull_to_frustum=True)
+        settings = RasterizationSettings(size, blur_radius=_SEAM, z_clip_value=_NEAREST_M, cull_to_frustum=True)
         fragments = MeshRasterizer(camera, settings)(self._mesh())
         face, z = fragments.pix_to_face.flatten(), fragments.zbuf.flatten()
         return face, torch.where(face >= 0, z, torch.inf)

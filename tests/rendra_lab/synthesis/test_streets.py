@@ -97,7 +97,7 @@ def test_pictures_have_detail_and_the_ground_no_holes(streets: list[PosedViews])
 
 
 def test_the_camera_drives_on_the_road_and_in_nothing() -> None:
-    for seed in range(12):
+    for seed in range(8):
         street = build_street(np.random.default_rng(seed), clear=8.0)
         corners = street.faces.corners
         x, y, z = corners.min(1), corners.max(1), corners.mean(1)
@@ -147,12 +147,12 @@ def test_cars_have_no_gaps_in_their_sides() -> None:
     """Seen from behind and aside, nothing of what stands beyond shows through a car of each kind."""
     for number in range(len(street_parts._CAR_KINDS)):
         body = street_parts._car(number)
-        beyond = quads([[(-9, 9, 9), (9, 9, 9), (9, -9, 9), (-9, -9, 9)]], [(0, 0)] * 4, 0)
-        faces = PaintedFaces.joined([body.placed((-0.8, -1.2, 4.5), 0.35), beyond])
+        beyond = quads([[(-9, 9, 15), (9, 9, 15), (9, -9, 15), (-9, -9, 15)]], [(0, 0)] * 4, 0)
+        faces = PaintedFaces.joined([body.placed((0.5, -1.2, 6.5), 0.35), beyond])
         scene = SunlitScene(faces, torch.ones(64, 2, 2, 4), DULL, OPEN)
         _, depth = scene.take(torch.tensor([[300.0, 0, 128], [0, 300, 128], [0, 0, 1]]), torch.eye(4), (256, 256))
-        is_car = (depth < 8.9)[None].float()
-        closed = -torch.nn.functional.max_pool2d(-torch.nn.functional.max_pool2d(is_car, 5, 1, 2), 5, 1, 2)
-        slits = (closed - is_car)[0, 0, : 128 + 40]  # higher than the wheels
-        assert int(is_car.sum()) > 8000
+        nearness = 1 / depth[None]
+        closed = -F.max_pool2d(-F.max_pool2d(nearness, 5, 1, 2), 5, 1, 2)
+        slits = (closed > 1.1 * nearness)[0, 0, : 128 + 40]  # higher than the wheels
+        assert int((depth < 14).sum()) > 8000
         assert int(slits.sum()) <= 6, number  # notches of the outline

@@ -49,6 +49,13 @@ def test_depth_is_that_of_the_nearest_surface_and_infinite_in_the_sky() -> None:
     assert int(((depth - 6).abs() < 1e-3).sum()) == 6 * 10
 
 
+def test_no_ray_slips_between_two_triangles() -> None:
+    wide = torch.tensor([[16.0, 0, 16], [0, 16.0, 16], [0, 0, 1]])
+    scene = SunlitScene(poster(4.0, RED, 8.0), textures(), daylight(0.0), OPEN)
+    _, depth = scene.take(wide, torch.eye(4), (32, 32))  # the diagonal runs through the middles of pixels
+    assert bool(torch.isfinite(depth).all())
+
+
 def test_the_floor_has_the_depth_of_its_plane() -> None:
     floor = flat((-50, 50), -1.5, (0.1, 90), RED, (1.0, 1.0))
     _, depth = taken(floor)
