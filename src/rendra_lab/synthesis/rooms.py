@@ -7,7 +7,7 @@ Letters: V views, C corners.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -56,14 +56,14 @@ class Room:
     Attributes:
         extent: width, height and depth.
         placed: all that stands and hangs in it, its walls' fixtures last.
-        blockers: what keeps light and people away.
+        obstacles: the boxes about all of it.
         surfaces: its triangles and their light.
         pictures: of its materials.
     """
 
     extent: tuple[float, float, float]
     placed: tuple[Placed, ...]
-    blockers: Blockers
+    obstacles: Blockers
     surfaces: LitSurfaces
     pictures: TexturePyramid
 
@@ -129,18 +129,18 @@ def build_room(seed: int) -> Room:
     walls = [build_wall(wall, extent, openings, style) for wall in range(WALLS)]
     surroundings = [Placed(tuple(floor_and_ceiling(extent, bool(rng.random() < 0.5)))), *(one for one, _ in walls)]
     placed = (*furnishing.placed, *(fixtures for _, fixtures in walls))
-    blockers = _blockers(placed)
+    blockers = _boxes(placed, lambda solid: solid.casts and not solid.glow)
     shell = [solid for one in surroundings for solid in one.in_room()]
     things = [solid for one in placed for solid in one.in_room()]
     surfaces = _lit(shell, things, extent, _lights(extent, openings, furnishing.lamps, rng), blockers, rng)
-    return Room(extent, placed, blockers, surfaces, paint_surfaces(rng))
+    return Room(extent, placed, _boxes(placed, lambda solid: True), surfaces, paint_surfaces(rng))
 
 
-def _blockers(placed: Sequence[Placed]) -> Blockers:
-    """The boxes about the solids that keep light away."""
+def _boxes(placed: Sequence[Placed], which: Callable[[Solid], bool]) -> Blockers:
+    """The boxes about some of the solids."""
     groups = []
     for one in placed:
-        boxes = [solid.bounds().reshape(-1) for solid in one.solids if solid.casts and not solid.glow]
+        boxes = [solid.bounds().reshape(-1) for solid in one.solids if which(solid)]
         if boxes:
             groups.append((np.stack(boxes), one.yaw, one.place))
     return Blockers.of(groups)
@@ -247,7 +247,7 @@ def _sides_a_metre(corners: Tensor, places: Tensor) -> Tensor:
 def has_clearance(room: Room, places: Floats, margin: float = CLEARANCE_M) -> npt.NDArray[np.bool_]:
     """Whether places (N, 3) lie in the room, away from walls and furniture by a margin along each axis: (N,)."""
     inside = ((places > margin) & (places < np.array(room.extent) - margin)).all(1)
-    return inside & ~room.blockers.hold(places, margin)
+    return inside & ~room.obstacles.hold(places, margin)
 
 
 def _stand_somewhere(room: Room, rng: _RNG) -> tuple[Floats, float]:

@@ -83,6 +83,8 @@ def test_nobody_stands_in_a_wall_or_in_furniture(rooms: list[Room]) -> None:
         assert bool(has_clearance(room, eyes, CLEARANCE_M - 1e-4).all())
         assert bool((eyes > CLEARANCE_M - 1e-4).all() & (eyes < np.array(room.extent) - CLEARANCE_M + 1e-4).all())
         assert np.ptp(eyes, 0).min() > 0.2
+        corners = np.concatenate([solid.points for one in room.placed for solid in one.in_room()])
+        assert np.abs(eyes[:, None] - corners).max(-1).min() > 0.6 * CLEARANCE_M  # a turned box's axes are not ours
 
 
 def test_views_turn_and_move_within_their_limits(rooms: list[Room]) -> None:
