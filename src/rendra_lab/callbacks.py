@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections import deque
@@ -303,8 +304,13 @@ class BatchReport(Callback):
         return batch_idx in _spread(list(range(total)), self.max_pictures)
 
 
+_HARDLY = 0.8  # of the first loss: a fit that ends above it has hardly begun
+
+
 class StopWhenSettled(Callback):
-    """Ends a fit whose loss is low enough, or has not improved for a while. Processes judge the mean of their losses.
+    """Ends a fit whose loss is low enough, or has not improved for a while, which it says, and what came of it.
+
+    Processes judge the mean of their losses.
 
     Args:
         monitor: what Lightning logs, such as `train/loss`.
@@ -324,6 +330,7 @@ class StopWhenSettled(Callback):
         self.below = below
         self.patience = patience
         self.improvement = improvement
+        self._first = float("nan")
         self._best = float("inf")
         self._waited = 0
 
@@ -335,20 +342,27 @@ class StopWhenSettled(Callback):
         if self.monitor not in known:
             raise UserError(f"StopWhenSettled.monitor: there is no {self.monitor!r}; there are: {', '.join(known)}")
         value = float(trainer.strategy.reduce(known[self.monitor], reduce_op="mean"))
+        self._first = value if math.isinf(self._best) else self._first
         improved = self._best - value > self.improvement * abs(value)
         self._waited = 0 if improved else self._waited + 1
         self._best = min(self._best, value)
         low = self.below is not None and value < self.below
-        if low or (self.patience is not None and self._waited >= self.patience):
+        settled = self.patience is not None and self._waited >= self.patience
+        if settled and trainer.is_global_zero and not trainer.should_stop:
+            said = f"step {trainer.global_step}: {self.monitor} has settled, {self._first:.4g} to {self._best:.4g}"
+            nowhere = self._best > _HARDLY * self._first > 0
+            report.say(f"{said}; it hardly fell: the fit may have gone nowhere" if nowhere else said)
+        if low or settled:
             trainer.should_stop = True
 
     def state_dict(self) -> dict[str, Any]:
         """For the checkpoint."""
-        return {"best": self._best, "waited": self._waited}
+        return {"first": self._first, "best": self._best, "waited": self._waited}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """From a checkpoint."""
         self._best, self._waited = state_dict["best"], state_dict["waited"]
+        self._first = state_dict.get("first", self._first)
 
 
 def _publish(trainer: Trainer, pictures: dict[str, np.ndarray], tag: str, path: Path) -> None:

@@ -78,7 +78,7 @@ class WrittenSurface:
     def __str__(self) -> str:
         """One line for people."""
         if not self.files:
-            return "no mesh: the field has no surface, nothing in it stops half of the light"
+            return "no mesh: nothing in the field is dense enough yet to stop half of the light"
         pieces = int(components(self.mesh).amax()) + 1
         size = f"{len(self.mesh.verts_packed()):,} vertices and {len(self.mesh.faces_packed()):,} faces"
         closed = "closed" if is_watertight(self.mesh) else "NOT closed"
