@@ -156,7 +156,9 @@ class OneOfTwo:
 
 def steps_until_settled(values: list[float], **settings: Any) -> int:
     stop = StopWhenSettled("train/loss", **settings)
-    trainer = SimpleNamespace(callback_metrics={}, should_stop=False, strategy=OneOfTwo())
+    trainer = SimpleNamespace(
+        callback_metrics={}, should_stop=False, is_global_zero=True, global_step=0, strategy=OneOfTwo()
+    )
     for step, value in enumerate(values):
         trainer.callback_metrics["train/loss"] = torch.tensor(value)
         stop.on_train_batch_end(trainer, None, None, None, step)  # type: ignore[arg-type]
@@ -169,6 +171,14 @@ def steps_until_settled(values: list[float], **settings: Any) -> int:
 def test_a_fit_settles_whatever_the_sign_of_its_loss(sign: float) -> None:
     """Two gains, then losses that only grow worse."""
     assert steps_until_settled([sign + x for x in (5.0, 4.0, 3.0, 3.005, 3.006, 3.007, 3.008)], patience=3) == 5
+
+
+def test_a_fit_that_settles_where_it_began_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    steps_until_settled([5.0, 4.9, 4.9, 4.9, 4.9], patience=2)
+    assert "train/loss has settled" in (said := capsys.readouterr().out)
+    assert "hardly fell" in said
+    steps_until_settled([5.0, 1.0, 1.0, 1.0, 1.0], patience=2)
+    assert "hardly" not in capsys.readouterr().out
 
 
 def test_processes_stop_together() -> None:
