@@ -121,7 +121,7 @@ def test_haze_is_no_surface() -> None:
 def test_a_field_without_a_surface_gives_an_empty_mesh(density: float, tmp_path: Path) -> None:
     written = export_surface(Balls(density=density), SurfaceSettings(16), tmp_path / "mesh")
     assert len(written.mesh.faces_packed()) == 0
-    assert "no surface" in str(written)
+    assert "no mesh" in str(written)
     assert not list(tmp_path.iterdir())
 
 
@@ -219,7 +219,7 @@ def test_the_test_of_a_fit_leaves_the_mesh_and_its_distance(
     SurfaceExporter(str(tmp_path), resolution=RESOLUTION).on_test_epoch_end(trainer, task)  # type: ignore[arg-type]
     said = capsys.readouterr().out
     if density == 0:
-        assert "no surface" in said
+        assert "no mesh" in said
         assert not task.logged
         return
     assert "closed, 1 piece" in said

@@ -59,7 +59,7 @@ def test_a_run_leaves_bodies_that_meet_their_joints(compose: Callable[..., Any],
     assert record["metrics"]["test/limbs_outside"] == 1
     energies = {name for name in record["metrics"] if name.startswith("test/energy_")}
     assert energies == {f"test/energy_{name}" for name in
-                        ("joints", "natural_pose", "natural_bends", "usual_shape", "interpenetration")}  # fmt: skip
+                        ("joints", "natural_pose", "natural_bends", "joint_limits", "usual_shape", "interpenetration")}  # fmt: skip
     exports = folder / "exports"
     assert {path.name for path in exports.iterdir()} >= {"people.npz", "people.json", "person_0000.obj", "fit.gif"}
     assert len(list((exports / "people").glob("person_*.png"))) == 2
