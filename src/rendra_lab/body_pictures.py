@@ -248,7 +248,7 @@ def _parse(path: Path) -> Any:
         if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
             raise UserError(f"{path} claims more than {_MOST_BYTES:,} bytes of numbers")
     with np.load(path, allow_pickle=False) as content:
-        return {name: content[name] for name in content.files if name in ("pose", "betas")}
+        return {name: content[name] for name in content.files if name in ("pose", "betas", _FIT_KEY)}
 
 
 def sheets_of(choice: str | None) -> Iterator[str]:
