@@ -72,8 +72,8 @@ def _check_map(each: Any, batch_size: int) -> None:
 
 def _sample(each: Tensor, grid: Tensor, interp_mode: str, padding_mode: str, align_corners: bool) -> Tensor:
     """One map read at the grid. (N, C, V)"""
-    if len(each) == 0 or grid.shape[2] == 0:  # grid_sample refuses these
-        return each.new_zeros(len(each), each.shape[1], grid.shape[2])
+    if len(each) == 0 or grid.shape[2] == 0:  # grid_sample refuses these; their gradient is zero, not missing
+        return each.sum((2, 3))[..., None].expand(-1, -1, grid.shape[2])
     sampled = F.grid_sample(
         each, grid.to(each.dtype), mode=interp_mode, padding_mode=padding_mode, align_corners=align_corners
     )

@@ -151,6 +151,16 @@ class Topology:
 
         return self._matrix("laplacian", dtype, make)
 
+    def neighbours(self, dtype: torch.dtype) -> SparseMatrix:
+        """Takes rows at the vertices to their sums over the ends of all edges at a vertex. (sum V, sum V)"""
+
+        def make() -> SparseMatrix:
+            rows, columns = torch.cat([self.edges, self.edges.flip(1)]).unbind(1)
+            ones = torch.ones_like(rows, dtype=dtype)
+            return SparseMatrix(rows, columns, ones, (self.verts.total, self.verts.total), symmetric=True)
+
+        return self._matrix("neighbours", dtype, make)
+
     def edge_differences(self, dtype: torch.dtype) -> SparseMatrix:
         """Takes vertices to the vectors v1 - v0 of all edges. (E, sum V)"""
         return self._matrix("differences", dtype, lambda: self._at_edge_ends(-1.0, dtype))

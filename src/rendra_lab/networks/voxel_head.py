@@ -1,0 +1,97 @@
+"""From feature maps to a coarse solid of voxels, and from voxels to the mesh that is refined.
+
+Gkioxari, Malik and Johnson, "Mesh R-CNN", ICCV 2019, arXiv:1906.02739, Sec. 3.1 (voxel branch, cubify).
+Letters: N objects, C channels, V voxels along each side. Grids are [z, y, x] over a frustum (`rendra_lab.frustums`):
+columns and rows of a map are x and y, and channels of the last layer are z.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rendra.ops import cubify
+from rendra.structures import Meshes
+from rendra_lab.settings import Count, Positive
+
+
+class VoxelHead(nn.Module):
+    """A column of voxel logits behind each cell of a map: `convs` x (conv 3x3, ReLU), deconv 2x2, ReLU, conv 1x1.
+
+    The paper's heads: 6.764 M weights with 2048 channels in and 48 voxels (ShapeNet), 2.629 M with 256 and 24 (Pix3D).
+
+    Args:
+        in_channels: C of the maps.
+        side: V, even.
+        width: channels of the layers between.
+        convs: how many convolutions come first.
+        align_corners: maps of another size than V / 2 are resized so that the centres of their outermost cells keep
+            their places (True) or their outer edges do (False, the paper's).
+
+    Raises:
+        ValueError: an odd number of voxels.
+    """
+
+    def __init__(
+        self,
+        in_channels: Positive,
+        side: Positive = 48,
+        width: Positive = 256,
+        convs: Count = 4,
+        align_corners: bool = False,
+    ) -> None:
+        super().__init__()
+        if side % 2:
+            raise ValueError(f"the side of a voxel grid must be even, got {side}")
+        self.side = side
+        self.align_corners = align_corners
+        widths = [in_channels] + [width] * convs
+        layers: list[nn.Module] = []
+        for before, after in zip(widths, widths[1:], strict=False):
+            layers += [nn.Conv2d(before, after, 3, padding=1), nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.ConvTranspose2d(widths[-1], width, 2, stride=2), nn.ReLU())
+        self.last = nn.Conv2d(width, side, 1)
+        for layer in self.layers:
+            if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
+                nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")  # "MSRA"
+                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+        nn.init.normal_(self.last.weight, std=0.001)
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+
+    def forward(self, features: Float[Tensor, "N C H W"]) -> Float[Tensor, "N V V V"]:
+        """Logits of being filled, for maps of objects or of regions."""
+        half = (self.side // 2, self.side // 2)
+        if not len(features):
+            features = features.new_zeros(0, features.shape[1], *half)  # interpolation refuses these
+        elif features.shape[-2:] != half:
+            features = F.interpolate(features, half, mode="bilinear", align_corners=self.align_corners)
+        return self.last(self.layers(features))
+
+
+def cubified(logits: Float[Tensor, "N V V V"], threshold: float = 0.2) -> tuple[Meshes, Bool[Tensor, " N"]]:
+    """The surface of the voxels whose probability exceeds a threshold, over the cube [-1, 1]^3.
+
+    Where no voxel does, the central cube of half the side stands in, so that there always is a mesh to refine.
+    Not differentiable.
+
+    Returns:
+        N closed meshes, and which of them come from voxels.
+    """
+    probability = torch.sigmoid(logits.detach())
+    is_found = (probability > threshold).flatten(1).any(1)
+    side = logits.shape[-1]
+    center = slice(side // 4, max(side - side // 4, side // 4 + 1))
+    cube = torch.zeros_like(probability[:1])
+    cube[:, center, center, center] = 1
+    filled = torch.where(is_found[:, None, None, None], probability, cube)
+    return cubify(filled, threshold, align="corner"), is_found
+
+
+def central_tetrahedra(count: int, like: Tensor) -> Meshes:
+    """`count` tetrahedra about the middle of the cube [-1, 1]^3: something to refine that costs nothing."""
+    corners = [[0.5, 0.5, 0.5], [0.5, -0.5, -0.5], [-0.5, 0.5, -0.5], [-0.5, -0.5, 0.5]]
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], device=like.device)
+    verts = torch.tensor(corners, dtype=like.dtype, device=like.device)
+    return Meshes(verts.expand(count, -1, -1), faces.expand(count, -1, -1))
