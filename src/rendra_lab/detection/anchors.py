@@ -58,8 +58,10 @@ class LevelAnchors:
         )
 
     def _of_level(self, feature: Tensor, size: float, stride: int) -> Tensor:
-        y, x = ((torch.arange(n, device=feature.device) + self.offset) * stride for n in feature.shape[-2:])
+        dtype = torch.promote_types(feature.dtype, torch.float32)  # half precision has no pixels beyond 2048
+        ticks = (torch.arange(n, device=feature.device, dtype=dtype) for n in feature.shape[-2:])
+        y, x = ((tick + self.offset) * stride for tick in ticks)
         middles = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 1, 2)  # (H W, 1, 2)
-        ratios = torch.tensor(self.ratios, device=feature.device)
+        ratios = torch.tensor(self.ratios, device=feature.device, dtype=dtype)
         halves = size / 2 * torch.stack([ratios.rsqrt(), ratios.sqrt()], dim=-1)  # (A, 2)
-        return torch.cat([middles - halves, middles + halves], dim=-1).reshape(-1, 4).to(feature.dtype)
+        return torch.cat([middles - halves, middles + halves], dim=-1).reshape(-1, 4)

@@ -21,6 +21,8 @@ from torch.nn import functional as F
 
 _CANONICAL_STRIDE = 16  # of the level, the fourth, at which regions of the canonical side are looked up
 
+_MOST_SAMPLES = 64  # along a side of a cell, however large a region is
+
 
 class RoiAlign(nn.Module):
     """Mean of n x n bilinear samples in each of S x S cells of each region. Has no parameters.
@@ -28,7 +30,8 @@ class RoiAlign(nn.Module):
     Args:
         side: S.
         strides: pixels between the cells of each level, finest first, powers of 2.
-        samples: n; 0: as many as a cell of the result is wide (high) in cells of the map, rounded up.
+        samples: n; 0: as many as a cell of the result is wide (high) in cells of the map, rounded up,
+            64 at most.
         canonical_px: regions of this side are looked up at stride 16, those of half of it at stride 8, and so on.
             224 is the published one, for pictures of some 800 pixels.
 
@@ -116,19 +119,23 @@ class _Regions:
         low, high = self.edges[:, :, axis].unbind(1)
         extent = self.extents[:, axis, None, None]
         bin_size = (high - low) / side
-        counts = torch.full_like(self.first, samples) if samples else bin_size.ceil().clamp(1, 64).long()
-        most = samples or (int(counts.max()) if len(counts) else 1)
-        number = torch.arange(most, device=low.device)
-        inner = (number + 0.5) / counts[:, None]  # (R, n)
-        places = torch.arange(side, device=low.device)[:, None] + inner[:, None, :]
+        counts = torch.full_like(self.first, samples) if samples else _samples_across(bin_size)
+        number = torch.arange(samples or (int(counts.max()) if len(counts) else 1), device=low.device)
+        own = counts[:, None].to(low)
+        places = torch.arange(side, device=low.device)[:, None] + ((number + 0.5) / own)[:, None, :]
         at = low[:, None, None] + places * bin_size[:, None, None]  # (R, S, n)
         is_in = (at >= -1) & (at <= extent) & (number < counts[:, None])[:, None]
-        at = at.clamp_min(0).minimum((extent - 1).to(at))
+        at = at.where(is_in, 0).clamp_min(0).minimum((extent - 1).to(at))  # no NaN of a box that has lost its way
         below = at.floor()
-        share = (at - below) * is_in / counts[:, None, None]
+        whole = is_in / own[:, :, None]
+        share = (at - below) * whole
         cells = torch.stack([below.long(), (below.long() + 1).minimum(extent - 1)], dim=-1)
-        weights = torch.stack([is_in / counts[:, None, None] - share, share], dim=-1)
-        return _Taps(cells.flatten(2), weights.flatten(2).to(low), 2 * counts)
+        weights = torch.stack([whole - share, share], dim=-1)
+        return _Taps(cells.flatten(2), weights.flatten(2), 2 * counts)
+
+
+def _samples_across(bin_size: Tensor) -> Tensor:
+    return bin_size.nan_to_num(1).ceil().clamp(1, _MOST_SAMPLES).long()
 
 
 def _bags_of_samples(regions: _Regions, y: _Taps, x: _Taps) -> tuple[Tensor, Tensor]:

@@ -82,17 +82,20 @@ def _suppress(
     x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray,
     area: np.ndarray, first: np.ndarray, threshold: np.float32, gone: np.ndarray,
 ) -> None:  # fmt: skip
-    """Mark what goes; threads own groups. Flat loops over what is left of a group: they vectorise."""
+    """Mark what goes; threads own groups. Flat loops over slices of what is left of a group: they vectorise."""
     for group in prange(len(first) - 1):
-        for i in range(first[group], first[group + 1]):
+        end = first[group + 1]
+        for i in range(first[group], end):
             if gone[i]:
                 continue
             left, top, right, bottom, own = x0[i], y0[i], x1[i], y1[i], area[i]
-            for j in range(i + 1, first[group + 1]):
-                width = (x1[j] if x1[j] < right else right) - (x0[j] if x0[j] > left else left)
-                height = (y1[j] if y1[j] < bottom else bottom) - (y0[j] if y0[j] > top else top)
-                shared = (width if width > _ZERO else _ZERO) * (height if height > _ZERO else _ZERO)
-                gone[j] |= shared > threshold * (own + area[j] - shared)
+            lefts, tops, rights, bottoms = x0[i + 1 : end], y0[i + 1 : end], x1[i + 1 : end], y1[i + 1 : end]
+            rest, marks = area[i + 1 : end], gone[i + 1 : end]
+            for j in range(end - i - 1):
+                width = min(rights[j], right) - max(lefts[j], left)
+                height = min(bottoms[j], bottom) - max(tops[j], top)
+                shared = max(width, _ZERO) * max(height, _ZERO)
+                marks[j] |= np.int32(shared > threshold * (own + rest[j] - shared))
 
 
 def _is_kept_in_rounds(boxes: Tensor, first: Tensor, threshold: float) -> Tensor:
