@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import io
 import logging
-import struct
-import warnings
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.io
 
+from rendra_lab.data.matlab_files import read_matlab
 from rendra_lab.data.picture_files import find_picture, upright_size
 from rendra_lab.errors import UserError
 from rendra_lab.tasks.smplify.joint_layouts import Joints
@@ -37,8 +34,6 @@ log = logging.getLogger(__name__)
 _FILES = ("est_joints.npz", "joints.mat")
 _FLAGS = ("auto", "seen", "hidden")
 _MOST_BYTES = 64 << 20
-_COMPRESSED = 15  # data type of MATLAB's files
-_HEADER = 128  # bytes before the first variable
 
 
 class LSP(PicturePeople):
@@ -141,7 +136,7 @@ def read_annotations(path: Path, flags: str = "auto") -> tuple[npt.NDArray[np.fl
     Raises:
         UserError: another file, another shape, or flags that are neither 0 nor 1.
     """
-    joints = _matlab_joints(path)
+    joints = read_matlab(path, "joints", "an array (3, 14, N) or (14, 3, N)", 42 * MOST_PEOPLE)
     joints = joints[..., None] if joints.ndim == 2 else joints
     if joints.ndim != 3 or joints.shape[:2] not in ((3, 14), (14, 3)):
         raise UserError(f"{path}: 'joints' has the shape {joints.shape}; expected (3, 14, N) or (14, 3, N)")
@@ -180,53 +175,6 @@ def _arrays(path: Path) -> Iterator[tuple[str, npt.NDArray[Any]]]:
         raise
     except Exception as error:  # of the archive, of zlib, and of the header's parser, which evaluates text
         raise UserError(f"{path} is no .npz file that can be read: {_one_line(error)}") from error
-
-
-def _matlab_joints(path: Path) -> npt.NDArray[np.float64]:
-    """The variable joints."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of variables that come twice
-            known = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(io.BytesIO(_inflated(path)))}
-            if "joints" not in known:
-                held = ", ".join(map(repr, known)) or "nothing"
-                raise UserError(f"{path}: 'joints' is missing; it holds {held}")
-            shape, kind = known["joints"]
-            if kind in ("cell", "struct", "object", "char", "function", "opaque", "unknown", "sparse"):
-                raise UserError(f"{path}: 'joints' is a {kind}; expected an array (3, 14, N) or (14, 3, N)")
-            if np.prod(shape, dtype=float) > 42 * MOST_PEOPLE:
-                raise UserError(f"{path}: 'joints' has the shape {shape}; at most {MOST_PEOPLE:,} people are read")
-            return _numbers(path, scipy.io.loadmat(io.BytesIO(_inflated(path)), variable_names=["joints"])["joints"])
-    except UserError:
-        raise
-    except Exception as error:  # scipy raises what it likes; NotImplementedError of version 7.3, which is HDF5
-        raise UserError(f"{path} is no MATLAB file that can be read: {_one_line(error)}") from error
-
-
-def _inflated(path: Path) -> bytes:
-    """A file of MATLAB's whose variables are not compressed, so that none is larger than the file."""
-    if path.stat().st_size > _MOST_BYTES:
-        raise UserError(f"{path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
-    data = path.read_bytes()
-    if data[126:128] not in (b"IM", b"MI"):
-        return data  # version 4, which compresses nothing
-    order = "<" if data[126:128] == b"IM" else ">"
-    parts, at = [data[:_HEADER]], _HEADER
-    left = _MOST_BYTES
-    while at + 8 <= len(data):
-        kind, size = struct.unpack(f"{order}II", data[at : at + 8])
-        body = data[at + 8 : at + 8 + size]
-        if kind == _COMPRESSED:
-            stream = zlib.decompressobj()
-            plain = stream.decompress(body, left)
-            if stream.unconsumed_tail:
-                raise UserError(f"{path} takes more than {_MOST_BYTES:,} bytes; no more are read")
-            left = max(1, left - len(plain))
-        else:
-            plain = data[at : at + 8 + size]
-        parts.append(plain)
-        at += 8 + size
-    return b"".join(parts)
 
 
 def _numbers(path: Path, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
