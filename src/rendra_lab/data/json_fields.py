@@ -96,6 +96,14 @@ class Fields:
             raise self.complaint(key, "a list of objects, one at least")
         return value
 
+    def numbers(self, key: str, count: int) -> list[float]:
+        """A list of so many finite numbers."""
+        value = self.tree.get(key)
+        numbers = [_finite(item) for item in value] if isinstance(value, list) else []
+        if len(numbers) != count or None in numbers:
+            raise self.complaint(key, f"a list of {count} finite numbers")
+        return [number for number in numbers if number is not None]
+
     def pose(self, key: str) -> Tensor:
         """A matrix (4, 4) float64; 0 0 0 1 is added below three rows."""
         rows = self.tree.get(key)
@@ -112,28 +120,28 @@ class Fields:
         return torch.tensor([*numbers, [0.0, 0.0, 0.0, 1.0]][:4], dtype=torch.float64)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, most_bytes: int = _MOST_BYTES) -> dict[str, Any]:
     """The object that a JSON file holds.
 
     Raises:
         UserError: as `read_json_value`, or no object.
     """
-    tree = read_json_value(path)
+    tree = read_json_value(path, most_bytes)
     if not isinstance(tree, dict):
         raise UserError(f"{path} holds a {type(tree).__name__}; expected an object")
     return tree
 
 
-def read_json_value(path: Path) -> Any:
+def read_json_value(path: Path, most_bytes: int = _MOST_BYTES) -> Any:
     """What a JSON file holds, a list perhaps.
 
     Raises:
-        UserError: no file, one of more than 64 MiB, no JSON, or nested too deeply.
+        UserError: no file, one of more bytes than that (64 MiB), no JSON, or nested too deeply.
     """
     if not path.is_file():
         raise UserError(f"there is no file {path}")
-    if path.stat().st_size > _MOST_BYTES:
-        raise UserError(f"{path} has {path.stat().st_size:,} bytes; at most {_MOST_BYTES:,} are read")
+    if path.stat().st_size > most_bytes:
+        raise UserError(f"{path} has {path.stat().st_size:,} bytes; at most {most_bytes:,} are read")
     try:
         return json.loads(path.read_bytes())
     except RecursionError as error:
