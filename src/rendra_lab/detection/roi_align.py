@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional as F
+
+from rendra_lab.detection.weighted_rows import weighted_rows
 
 _CANONICAL_STRIDE = 16  # of the level, the fourth, at which regions of the canonical side are looked up
 
@@ -72,9 +73,9 @@ class RoiAlign(nn.Module):
         # rows of channels, all cells of all pictures of all levels one after the other
         table = torch.cat([feature.permute(0, 2, 3, 1).reshape(-1, feature.shape[1]) for feature in features])
         y, x = (regions.taps(axis, self.side, self.samples) for axis in (1, 0))
-        bags = _bags_of_samples(regions, y, x) if self.samples else _ragged_bags(regions, y, x)
-        rows = _weighted_rows(table, *bags)
-        return rows.reshape(len(boxes), self.side, self.side, table.shape[1]).permute(0, 3, 1, 2).contiguous()
+        bags = _even_bags(regions, y, x) if self.samples else _ragged_bags(regions, y, x)
+        cells = weighted_rows(table, *bags)
+        return cells.reshape(len(boxes), self.side, self.side, table.shape[1]).permute(0, 3, 1, 2).contiguous()
 
 
 def levels_of(boxes: Float[Tensor, "R 4"], strides: Sequence[int], canonical_px: float = 224.0) -> Int[Tensor, " R"]:
@@ -138,18 +139,17 @@ def _samples_across(bin_size: Tensor) -> Tensor:
     return bin_size.nan_to_num(1).ceil().clamp(1, _MOST_SAMPLES).long()
 
 
-def _bags_of_samples(regions: _Regions, y: _Taps, x: _Taps) -> tuple[Tensor, Tensor]:
-    """Rows of the table and their weights, both (R S S, T T)."""
-    number, side, taps = y.cells.shape
+def _even_bags(regions: _Regions, y: _Taps, x: _Taps) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows of the table and weights, T T for each of the R S S cells; where those of each cell begin."""
     start = regions.first[:, None, None] + y.cells * regions.extents[:, 0, None, None]
     rows = start[:, :, None, :, None] + x.cells[:, None, :, None, :]  # (R, S, S, T, T)
     weights = y.weights[:, :, None, :, None] * x.weights[:, None, :, None, :]
-    shape = (number * side * side, taps * taps)
-    return rows.reshape(shape), weights.reshape(shape)
+    offsets = torch.arange(0, rows.numel(), rows.shape[3] * rows.shape[4], device=rows.device)
+    return rows.flatten(), weights.flatten(), offsets
 
 
 def _ragged_bags(regions: _Regions, y: _Taps, x: _Taps) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and weights one after the other, and where those of each of the R S S cells begin."""
+    """The same where the regions differ in their numbers of samples."""
     number, side, _ = y.cells.shape
     sizes = (y.counts * x.counts).repeat_interleave(side * side)
     offsets = sizes.cumsum(0) - sizes
@@ -161,8 +161,3 @@ def _ragged_bags(regions: _Regions, y: _Taps, x: _Taps) -> tuple[Tensor, Tensor,
     at_x = ((region * side + cell % side) * x.cells.shape[2]) + rank % line
     rows = regions.first[region] + y.cells.flatten()[at_y] * regions.extents[:, 0][region] + x.cells.flatten()[at_x]
     return rows, y.weights.flatten()[at_y] * x.weights.flatten()[at_x], offsets
-
-
-def _weighted_rows(table: Tensor, rows: Tensor, weights: Tensor, offsets: Tensor | None = None) -> Tensor:
-    """Weighted sums of rows of the table, one a bag."""
-    return F.embedding_bag(rows, table, offsets, mode="sum", per_sample_weights=weights.to(table))
