@@ -63,11 +63,13 @@ class Furniture:
         name: what it is: table, armchair, floor lamp.
         kind: which of CLASSES.
         solids: of which it consists.
+        model: of whose shape it is, where shapes come from a collection.
     """
 
     name: str
     kind: str
     solids: tuple[Solid, ...]
+    model: str = ""
 
     def bounds(self) -> Floats:
         """The least and the greatest coordinates: (2, 3)."""

@@ -20,7 +20,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.settings import Range, check_numbers
 from rendra_lab.synthesis.baked_light import Blockers, Lights, bake, openness
 from rendra_lab.synthesis.posed_views import PosedViews
-from rendra_lab.synthesis.rooms_furnishing import Lamp, furnish
+from rendra_lab.synthesis.rooms_furnishing import Furnishing, Lamp, furnish
 from rendra_lab.synthesis.rooms_shell import (
     WALLS,
     Opening,
@@ -44,6 +44,9 @@ _PLACES = 256  # that are tried for the eye
 _MOVES = 64  # that are tried for each view
 _RNG = np.random.Generator
 
+Furnish = Callable[[tuple[float, float, float], tuple[Opening, ...], np.random.Generator], Furnishing]
+"""What furnishes a room of an extent with its openings."""
+
 Degrees = Annotated[float, Range(0, 45)]
 Metres = Annotated[float, Range(0, 1)]
 FieldOfView = Annotated[float, Range(20, 140)]
@@ -59,6 +62,7 @@ class Room:
         obstacles: the boxes about all of it.
         surfaces: its triangles and their light.
         pictures: of its materials.
+        owners: (F,) rows of what is placed to which triangles belong; -1 for floor, ceiling and walls.
     """
 
     extent: tuple[float, float, float]
@@ -66,6 +70,7 @@ class Room:
     obstacles: Blockers
     surfaces: LitSurfaces
     pictures: TexturePyramid
+    owners: Tensor
 
 
 class RoomWorld:
@@ -120,12 +125,17 @@ class RoomWorld:
         return torch.stack(poses)
 
 
-def build_room(seed: int) -> Room:
-    """The room of a seed: its walls, its furniture and its light."""
+def build_room(seed: int, furnisher: Furnish = furnish) -> Room:
+    """The room of a seed: its walls, its furniture and its light.
+
+    Args:
+        seed: of all of it.
+        furnisher: says what stands and hangs where, and which lamps shine.
+    """
     rng = np.random.default_rng([seed, 1])
     extent = (rng.uniform(3.0, 6.0), rng.uniform(2.4, 3.0), rng.uniform(3.0, 6.0))
     style, openings = draw_style(rng), draw_openings(extent, rng)
-    furnishing = furnish(extent, openings, rng)
+    furnishing = furnisher(extent, openings, rng)
     walls = [build_wall(wall, extent, openings, style) for wall in range(WALLS)]
     surroundings = [Placed(tuple(floor_and_ceiling(extent, bool(rng.random() < 0.5)))), *(one for one, _ in walls)]
     placed = (*furnishing.placed, *(fixtures for _, fixtures in walls))
@@ -133,7 +143,15 @@ def build_room(seed: int) -> Room:
     shell = [solid for one in surroundings for solid in one.in_room()]
     things = [solid for one in placed for solid in one.in_room()]
     surfaces = _lit(shell, things, extent, _lights(extent, openings, furnishing.lamps, rng), blockers, rng)
-    return Room(extent, placed, _boxes(placed, lambda solid: True), surfaces, paint_surfaces(rng))
+    obstacles = _boxes(placed, lambda solid: True)
+    return Room(extent, placed, obstacles, surfaces, paint_surfaces(rng), _owners(shell, placed))
+
+
+def _owners(shell: list[Solid], placed: Sequence[Placed]) -> Tensor:
+    """Rows of what is placed (F,) to which the triangles of shell and things belong."""
+    none = sum(len(solid.faces) for solid in shell)
+    counts = [none, *(sum(len(solid.faces) for solid in one.solids) for one in placed)]
+    return torch.from_numpy(np.repeat(np.arange(-1, len(placed)), counts))
 
 
 def _boxes(placed: Sequence[Placed], which: Callable[[Solid], bool]) -> Blockers:

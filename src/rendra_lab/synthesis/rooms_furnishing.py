@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,9 @@ _RNG = np.random.Generator
 _TRIES = 24  # at places for one piece
 _DOOR_ROOM = 0.8  # metres before a door where nothing stands
 _GAP = 0.04  # metres between pieces at least
+
+Stock = Callable[[str, np.random.Generator, Finish], Furniture]
+"""What gives a piece of a name, of some materials."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ def furnish(
     extent: tuple[float, float, float], openings: tuple[Opening, ...], rng: np.random.Generator
 ) -> Furnishing:
     """Furniture of a living room, a bedroom, a dining room or a study, as much as finds a place."""
-    room = _Room(extent, openings, rng)
+    room = Furnisher(extent, openings, rng)
     plans = (_living, _bedroom, _dining, _study)
     plans[rng.integers(len(plans))](room)
     for _ in range(int(rng.integers(0, 3))):
@@ -55,7 +59,7 @@ def furnish(
     return Furnishing(tuple(room.placed), tuple(room.lamps))
 
 
-def _living(room: _Room) -> None:
+def _living(room: Furnisher) -> None:
     couch = room.against_wall("sofa")
     if couch is not None:
         room.before(couch, "coffee table", room.rng.uniform(0.3, 0.5), with_rug=True)
@@ -65,7 +69,7 @@ def _living(room: _Room) -> None:
         room.in_corner("easy chair")
 
 
-def _bedroom(room: _Room) -> None:
+def _bedroom(room: Furnisher) -> None:
     head = room.against_wall("bed")
     if head is not None:
         for side in (-1, 1):
@@ -77,14 +81,14 @@ def _bedroom(room: _Room) -> None:
     room.some("easy chair", "chair")
 
 
-def _dining(room: _Room) -> None:
+def _dining(room: Furnisher) -> None:
     room.table_with_chairs()
     room.against_wall("cupboard", topped=("vase", "table lamp"))
     room.some("bookcase", "cupboard", "wardrobe")
     room.some("sofa", "easy chair")
 
 
-def _study(room: _Room) -> None:
+def _study(room: Furnisher) -> None:
     place = room.against_wall("desk", topped=("table lamp",))
     if place is not None:
         room.before(place, "office chair", room.rng.uniform(-0.2, 0.1), faces_it=True)
@@ -96,11 +100,20 @@ def _study(room: _Room) -> None:
         room.lay_rug(width / 2, depth / 2, 0.0)
 
 
-class _Room:
-    """A room while it is furnished."""
+class Furnisher:
+    """A room while it is furnished.
 
-    def __init__(self, extent: tuple[float, float, float], openings: tuple[Opening, ...], rng: _RNG) -> None:
-        self.extent, self.openings, self.rng = extent, openings, rng
+    Args:
+        extent: of the room.
+        openings: before which nothing stands.
+        rng: makes all choices.
+        stock: gives a piece of a name, of some materials.
+    """
+
+    def __init__(
+        self, extent: tuple[float, float, float], openings: tuple[Opening, ...], rng: _RNG, stock: Stock = draw
+    ) -> None:
+        self.extent, self.openings, self.rng, self.stock = extent, openings, rng, stock
         self.placed: list[Placed] = []
         self.lamps: list[Lamp] = []
         self.finish: Finish = draw_finish(rng)
@@ -248,11 +261,11 @@ class _Room:
     def _draw(self, name: str) -> Furniture:
         """A piece, mostly of the materials of the room."""
         finish = self.finish if self.rng.random() < 0.65 else draw_finish(self.rng)
-        return draw(name, self.rng, replace(finish, cover_color=draw_finish(self.rng).cover_color))
+        return self.stock(name, self.rng, replace(finish, cover_color=draw_finish(self.rng).cover_color))
 
     def _stand(self, piece: Furniture, x: float, z: float, yaw: float, close: bool = False) -> Placed | None:
         """Stands a piece at a place if it is free; chairs may reach under tables."""
-        placed = Placed(piece.solids, (float(x), 0.0, float(z)), yaw)
+        placed = Placed.of(piece, (float(x), 0.0, float(z)), yaw)
         (left, back), (right, front) = placed.footprint()
         width, _, depth = self.extent
         if left < 0.02 or back < 0.02 or right > width - 0.02 or front > depth - 0.02:
@@ -275,7 +288,7 @@ class _Room:
         x = stands.place[0] + along * math.cos(stands.yaw)
         z = stands.place[2] - along * math.sin(stands.yaw)
         top = max(float(solid.bounds()[1, 1]) for solid in stands.solids[:1]) if piece.kind != "desk" else high[1]
-        thing = Placed(self._draw(name).solids, (x, float(top), z), stands.yaw)
+        thing = Placed.of(self._draw(name), (x, float(top), z), stands.yaw)
         self.placed.append(thing)
         if name == "table lamp":
             self.lamps.append(Lamp((x, thing.height() + 0.04, z), _warm(self.rng, 0.2)))

@@ -11,8 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rendra_lab.synthesis.furniture_pieces import Furniture
 from rendra_lab.synthesis.rooms_surfaces import NUM_PAINTINGS, wood_color
-from rendra_lab.synthesis.solids import Color, Floats, Solid, box, cylinder, ellipsoid, grid_lines, lathe, sheet
+from rendra_lab.synthesis.solids import (
+    Color,
+    Floats,
+    Solid,
+    box,
+    cylinder,
+    ellipsoid,
+    grid_lines,
+    lathe,
+    rotation,
+    sheet,
+)
 
 WALLS = 4
 _FLOOR_CELL, _WALL_CELL, _CEILING_CELL = 0.17, 0.24, 0.4  # metres between corners at which light is known
@@ -55,16 +67,35 @@ class Placed:
         place: of their origin in the room.
         yaw: by which they are turned, from z to x, radians.
         is_walked_on: a rug, which one can stand upon.
+        piece: what the solids are, in axes of its own; None for what is no furniture.
+        tilt: by which the piece is turned and moved before all else: (4, 4), for columns; None: it stands upright.
     """
 
     solids: tuple[Solid, ...]
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     yaw: float = 0.0
     is_walked_on: bool = False
+    piece: Furniture | None = None
+    tilt: Floats | None = None
+
+    @classmethod
+    def of(
+        cls, piece: Furniture, place: tuple[float, float, float], yaw: float = 0.0, tilt: Floats | None = None
+    ) -> Placed:
+        """A piece at a place."""
+        solids = piece.solids if tilt is None else tuple(solid.posed(tilt) for solid in piece.solids)
+        return cls(solids, place, yaw, piece=piece, tilt=tilt)
 
     def in_room(self) -> list[Solid]:
         """The solids in the axes of the room."""
         return [solid.turned("y", self.yaw).moved(*self.place) for solid in self.solids]
+
+    def to_room(self) -> Floats:
+        """From the axes of the piece to those of the room: (4, 4), for columns."""
+        matrix = np.eye(4, dtype=np.float32)
+        matrix[:3, :3] = rotation("y", self.yaw)
+        matrix[:3, 3] = self.place
+        return matrix if self.tilt is None else (matrix @ self.tilt).astype(np.float32)
 
     def footprint(self) -> Floats:
         """Least x and z and greatest x and z: (2, 2)."""

@@ -56,6 +56,11 @@ class Solid:
         matrix = rotation(axis, angle).T
         return replace(self, points=self.points @ matrix, normals=self.normals @ matrix)
 
+    def posed(self, matrix: Floats) -> Solid:
+        """The same, turned and moved by a rigid matrix (4, 4), for columns."""
+        turn = matrix[:3, :3].T
+        return replace(self, points=self.points @ turn + matrix[:3, 3], normals=self.normals @ turn)
+
     def bounds(self) -> Floats:
         """The least and the greatest coordinates: (2, 3)."""
         return np.stack([self.points.min(0), self.points.max(0)])

@@ -75,8 +75,7 @@ def picture_views(
         samples = intrinsics.new_tensor([_SIDE, _SIDE, 1])[:, None] * matrix
         shown = shade(surfaces, pictures, mesh, samples, pose, fine)
         colors.append(to_bytes(F.avg_pool2d(shown[None], _SIDE)[0]))
-        zbuf = _rasterizer(matrix, pose, size)(mesh).zbuf[0, ..., 0]
-        depths.append(torch.where(zbuf > 0, zbuf, torch.inf)[None])
+        depths.append(faces_seen(mesh, matrix, pose, size)[1][None])
     return PosedViews(torch.stack(colors), torch.stack(depths), intrinsics, world_to_camera)
 
 
@@ -110,6 +109,22 @@ def shade(
     albedo = pictures.look_up(surfaces.which[face], seen[:, :2], extent) * surfaces.tint.index_select(0, face)
     radiance = albedo * seen[:, 2:] * is_hit[:, None]
     return toned(radiance).view(*size, 3).movedim(-1, 0)
+
+
+def faces_seen(
+    mesh: Meshes, intrinsics: Float[Tensor, "3 3"], pose: Float[Tensor, "4 4"], size: tuple[int, int]
+) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """The face that is seen at the middle of each pixel, -1 for none, and its depth, inf for none.
+
+    Args:
+        mesh: one mesh, in the world.
+        intrinsics: pixels.
+        pose: world to camera.
+        size: H and W.
+    """
+    fragments = _rasterizer(intrinsics, pose, size)(mesh)
+    face, z = fragments.pix_to_face[0, ..., 0], fragments.zbuf[0, ..., 0]
+    return face, torch.where(face >= 0, z, torch.inf)
 
 
 def toned(radiance: Tensor) -> Tensor:
