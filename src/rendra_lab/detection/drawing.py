@@ -8,7 +8,7 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -133,7 +133,7 @@ def _seen(scene: Meshes, intrinsics: Tensor, size: Sequence[int]) -> tuple[Tenso
     )  # fmt: skip
     rasterizer = MeshRasterizer(cameras, RasterizationSettings(image_size=(height, width), cull_to_frustum=False))
     fragments = rasterizer(scene)
-    lights = Headlight().lights(cameras)
+    lights = Headlight().lights(cast(Any, cameras))
     shaded = HardPhongShader(cameras=cameras, lights=lights, materials=_MATTE.to(scene.device))(fragments, scene)
     cover = (fragments.pix_to_face[0, ..., :1] >= 0).to(shaded)
     planes = torch.cat([shaded[0, ..., :3].clamp(0, 1) * cover, cover], dim=-1).permute(2, 0, 1)

@@ -1,0 +1,203 @@
+"""The truth in the frames of regions, heads that learn it, losses that stay finite, and what the paper weighs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from rendra.structures import Meshes
+from rendra.utils import ico_sphere
+from rendra_lab.detection.object_frames import depth_extents, depth_ranges
+from rendra_lab.detection.records import DepthVerdicts, Detections, Instances, MeshVerdicts, PhotoBatch
+from rendra_lab.detection.roi_align import RoiAlign
+from rendra_lab.errors import UserError
+from rendra_lab.frustums import Frustums
+from rendra_lab.networks.mesh_refinement import MeshRefinement
+from rendra_lab.networks.voxel_head import VoxelHead
+from rendra_lab.shape_records import Shapes
+from rendra_lab.tasks.mesh_rcnn import shape_losses
+from rendra_lab.tasks.mesh_rcnn.depth_head import DepthHead, extents_of
+from rendra_lab.tasks.mesh_rcnn.shape_heads import ShapeHeads
+from rendra_lab.tasks.mesh_rcnn.shape_targets import shape_targets
+
+LENS = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
+BOXES = torch.tensor([[20.0, 12, 44, 36], [2.0, 2, 30, 30]])
+
+
+def balls(*centers: tuple[float, float, float], radius: float = 0.4) -> Shapes:
+    """Balls: 24 voxels a side over their bounding boxes."""
+    sphere, count = ico_sphere(2), len(centers)
+    middles = torch.tensor(centers)
+    ticks = (torch.arange(24) + 0.5) / 12 - 1
+    z, y, x = torch.meshgrid(ticks, ticks, ticks, indexing="ij")
+    filled = (x**2 + y**2 + z**2 < 1).expand(count, 24, 24, 24)
+    placed = torch.eye(4).repeat(count, 1, 1)
+    placed[:, :3, :3] *= radius
+    placed[:, :3, 3] = middles
+    unit = sphere.verts_packed()
+    verts = radius * unit + middles[:, None]
+    return Shapes(verts, unit.expand(count, -1, -1), filled, placed, tuple(verts), tuple(sphere.faces_list() * count))
+
+
+def photos(shapes: Shapes | None, boxes: Tensor) -> PhotoBatch:
+    """Two pictures, all objects in the first."""
+    count = len(boxes)
+    zeros = torch.zeros(count, dtype=torch.long)
+    objects = Instances(zeros, boxes, zeros + 1, torch.zeros(count, 48, 64, dtype=torch.bool), shapes)
+    sizes = torch.tensor([[48, 64], [48, 64]])
+    return PhotoBatch(torch.zeros(2, 3, 48, 64), sizes, LENS.repeat(2, 1, 1), objects, ["a", "b"])
+
+
+def heads(most_regions: int | None = None) -> ShapeHeads:
+    torch.manual_seed(0)
+    strides = (4, 8)
+    return ShapeHeads(
+        RoiAlign(3, strides), DepthHead(6, 2, side=3, width=8), RoiAlign(4, strides),
+        VoxelHead(6, side=8, width=8, convs=1), RoiAlign(7, strides),
+        MeshRefinement(6, width=8, stages=2, convs=1, padding_mode="border", align_corners=False),
+        points=200, most_regions=most_regions,
+    )  # fmt: skip
+
+
+def maps() -> list[Tensor]:
+    torch.manual_seed(1)
+    return [torch.randn(2, 6, 12, 16), torch.randn(2, 6, 6, 8)]
+
+
+def test_the_paper_s_depth_head_has_its_weights() -> None:
+    head = DepthHead(256, 9)
+    assert sum(parameter.numel() for parameter in head.parameters()) == 13_904_905
+
+
+def test_depths_are_those_of_the_class_and_bounded() -> None:
+    head = DepthHead(2, 3, side=1, width=4, layers=1)
+    torch.nn.init.constant_(head.last.weight, 0.0)
+    head.last.bias.data = torch.tensor([0.0, 1.0, 1e4])
+    values = head(torch.randn(3, 2, 1, 1), torch.tensor([1, 0, 2]))
+    assert extents_of(values).tolist() == pytest.approx([math.e, 1.0, 62.5])
+    assert head(torch.zeros(0, 2, 1, 1), torch.zeros(0, dtype=torch.long)).shape == (0,)
+
+
+def test_targets_are_the_object_in_the_frame_of_its_region() -> None:
+    shapes = balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0))
+    objects = torch.tensor([1, 0, 0])
+    boxes = BOXES[[1, 0, 1]]
+    truth = shape_targets(shapes, boxes, objects, LENS.repeat(3, 1, 1), side=8, points=50)
+    ranges = depth_ranges(shapes.verts)[objects]
+    frames = Frustums(boxes, ranges, LENS.repeat(3, 1, 1))
+    torch.testing.assert_close(truth.log_extents.exp(), depth_extents(frames))
+    assert ranges[1].tolist() == pytest.approx([1.6, 2.4], abs=1e-5)
+    back = frames.to_camera(truth.points)
+    centers = torch.tensor([[-0.5, -0.3, 3.0], [0.0, 0, 2], [0.0, 0, 2]])[:, None]
+    torch.testing.assert_close((back - centers).norm(dim=-1), torch.full((3, 50), 0.4), rtol=0, atol=2e-3)
+    assert bool(truth.is_near.all())
+    assert truth.voxels.shape == (3, 8, 8, 8)
+    assert bool(truth.voxels[1, 4, 4, 4])  # the ball fills the middle of its own region
+    assert not bool(truth.voxels[1, 0, 0, 0])
+    assert not bool(truth.voxels[2, :, :, 0].any())  # and lies in the right half of the other
+
+
+def test_an_object_that_reaches_far_out_of_its_region_teaches_no_mesh() -> None:
+    shapes = balls((0.0, 0.0, 2.0))
+    truth = shape_targets(shapes, torch.tensor([[30.0, 22, 32, 24]]), torch.tensor([0]), LENS, side=4, points=50)
+    assert not bool(truth.is_near.any())
+    assert float(truth.points.abs().max()) == 0.0
+
+
+def test_heads_learn_from_the_first_step_on() -> None:
+    made, features = heads(), maps()
+    for feature in features:
+        feature.requires_grad_()
+    batch = photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES)
+    said = made.learn(features, BOXES, torch.tensor([0, 1]), batch)
+    assert said.voxels.logits.shape == said.voxels.targets.shape == (2, 8, 8, 8)
+    assert len(said.meshes.stages) == 2
+    assert bool(said.meshes.is_valid.all())
+    loss = shape_losses.depth(said.depths) + shape_losses.mesh_stages(said.meshes) + said.voxels.logits.square().sum()
+    loss.backward()
+    assert bool(loss.isfinite())
+    learned = {name for name, weight in made.named_parameters() if weight.grad is not None}
+    assert learned == {name for name, _ in made.named_parameters()}
+    for feature in features:
+        assert feature.grad is not None
+        assert bool(feature.grad.isfinite().all())
+
+
+def test_no_region_teaches_nothing_and_every_weight_knows() -> None:
+    made = heads()
+    said = made.learn(maps(), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), photos(None, torch.zeros(0, 4)))
+    assert not bool(said.meshes.is_valid.any())
+    loss = shape_losses.depth(said.depths) + shape_losses.mesh_stages(said.meshes) + said.voxels.logits.sum()
+    assert loss.item() == 0
+    loss.backward()
+    for name, weight in made.named_parameters():
+        assert weight.grad is not None, name
+        assert not bool(weight.grad.any()), name
+
+
+def test_few_regions_are_drawn_from_many() -> None:
+    said = heads(most_regions=1).learn(
+        maps(), BOXES, torch.tensor([0, 1]), photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES)
+    )
+    assert len(said.depths.values) == len(said.voxels.logits) == len(said.meshes.stages[0]) == 1
+
+
+def test_objects_without_shapes_are_refused() -> None:
+    with pytest.raises(UserError, match="'a' and those beside it have objects without shapes"):
+        heads().learn(maps(), BOXES, torch.tensor([0, 1]), photos(None, BOXES))
+
+
+def test_found_objects_are_rebuilt_even_where_no_voxel_is() -> None:
+    made = heads().eval()
+    torch.nn.init.constant_(made.voxels.last.bias, -20.0)
+    labels = torch.tensor([1, 0])
+    found = Detections(torch.tensor([0, 1]), BOXES, labels, torch.ones(2))
+    with torch.no_grad():
+        rebuilt = made.rebuild(maps(), found)
+        none = made.rebuild(maps(), Detections(labels[:0], BOXES[:0], labels[:0], torch.ones(0)))
+    assert rebuilt.meshes is not None
+    assert rebuilt.depth_extents is not None
+    assert rebuilt.voxels is not None
+    assert float(rebuilt.voxels.max()) < 1e-6
+    assert rebuilt.meshes.num_faces_per_mesh().tolist() == [192, 192]  # 4 x 4 x 4 voxels
+    torch.testing.assert_close(rebuilt.meshes.verts_packed().abs().amax(), torch.tensor(0.5))
+    assert none.meshes is not None
+    assert len(none.meshes) == 0
+
+
+def stages_of(scale: float, is_valid: list[bool]) -> MeshVerdicts:
+    count, ball = len(is_valid), ico_sphere(3)
+    unit = ball.verts_packed().expand(count, -1, -1)
+    meshes = Meshes([scale * ball.verts_packed()] * count, ball.faces_list() * count)
+    return MeshVerdicts((meshes, meshes), unit, unit, torch.tensor(is_valid))
+
+
+def test_stages_are_summed_and_weighted_as_published() -> None:
+    verdicts = stages_of(2.0, [True, True])
+    apart = shape_losses.mesh_stages(verdicts, chamfer=1.0, normal=0.0, edge=0.0)
+    assert apart.item() == pytest.approx(2 * 2.0, rel=0.03)  # two stages, a squared distance of 1 both ways
+    turned = shape_losses.mesh_stages(verdicts, chamfer=0.0, normal=1.0, edge=0.0)
+    assert 0 <= turned.item() < 0.05
+    short, long = (
+        shape_losses.mesh_stages(stages_of(scale, [True]), chamfer=0.0, normal=0.0, edge=1.0) for scale in (1.0, 3.0)
+    )
+    assert long.item() == pytest.approx(9 * short.item(), rel=1e-4)
+
+
+def test_invalid_meshes_teach_nothing() -> None:
+    one, both = stages_of(2.0, [True]), stages_of(2.0, [True, False])
+    spoilt = replace(both, points=torch.cat([both.points[:1], both.points[1:] + 100]))
+    values = []
+    for verdicts in (one, spoilt):
+        torch.manual_seed(0)
+        values.append(shape_losses.mesh_stages(verdicts).item())
+    assert values[0] == pytest.approx(values[1], rel=1e-5)
+
+
+def test_the_depth_loss_is_a_mean() -> None:
+    errors = DepthVerdicts(torch.tensor([0.5, 3.0]), torch.tensor([0.0, 0.0]))
+    assert shape_losses.depth(errors).item() == pytest.approx((0.125 + 2.5) / 2)
