@@ -6,19 +6,15 @@ which builds it at another time, draws the same numbers.
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Protocol
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rendra_lab import report
-from rendra_lab.errors import UserError
 from rendra_lab.networks.efficientnet_lite import EfficientNetLite0
+from rendra_lab.networks.foreign_weights import ForeignWeights
 from rendra_lab.random_state import untouched
 
 _VGG19_FILE = "torchvision's vgg19-dcbb9e9d.pth, or the like as .safetensors"
@@ -107,11 +103,11 @@ class VGG19Pyramid(nn.Module):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        state = _weights_of(path)
+        weights = ForeignWeights(path, "VGG19", _VGG19_FILE)
         width = 3
         for number, wider in zip(_VGG19_CONVS, _VGG19_WIDTHS, strict=True):
             for kind, shape in (("weight", (wider, width, 3, 3)), ("bias", (wider,))):
-                self.register_buffer(f"{kind}{number}", _taken(state, f"features.{number}.{kind}", shape, path))
+                self.register_buffer(f"{kind}{number}", weights.taken(f"features.{number}.{kind}", shape))
             width = wider
 
     def levels(self, pictures: Tensor, count: int) -> list[Tensor]:
@@ -133,37 +129,3 @@ class VGG19Pyramid(nn.Module):
 def _halved(x: Tensor, pool: object = F.avg_pool2d) -> Tensor:
     """Half the resolution; a side of one pixel stays."""
     return pool(x, [min(2, side) for side in x.shape[-2:]])  # type: ignore[operator]
-
-
-def _weights_of(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise UserError(f"there is no file {report.short_path(path)} with the weights of VGG19: {_VGG19_FILE}")
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        pickle.UnpicklingError,
-        SafetensorError,
-        RuntimeError,
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-    ) as error:
-        words = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{report.short_path(path)} cannot be read as weights of VGG19: {words}") from error
-    if not isinstance(state, dict):
-        raise UserError(f"{report.short_path(path)} holds no weights by name: {_VGG19_FILE} is wanted")
-    return state
-
-
-def _taken(state: dict[str, Tensor], name: str, shape: tuple[int, ...], path: Path) -> Tensor:
-    found = state.get(name)
-    if not isinstance(found, Tensor) or found.shape != shape or not found.is_floating_point():
-        what = tuple(found.shape) if isinstance(found, Tensor) else "nothing"
-        raise UserError(
-            f"{report.short_path(path)} is not VGG19: {name} must be numbers {shape}, found {what}; "
-            f"{_VGG19_FILE} is wanted"
-        )
-    return found.detach().float()
