@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from rendra.structures import Meshes
 from rendra.utils import ico_sphere
+from rendra_lab import shape_losses
 from rendra_lab.detection.object_frames import depth_extents, depth_ranges
 from rendra_lab.detection.records import DepthVerdicts, Detections, Instances, MeshVerdicts, PhotoBatch
 from rendra_lab.detection.roi_align import RoiAlign
@@ -19,8 +18,8 @@ from rendra_lab.frustums import Frustums
 from rendra_lab.networks.mesh_refinement import MeshRefinement
 from rendra_lab.networks.voxel_head import VoxelHead
 from rendra_lab.shape_records import Shapes
-from rendra_lab.tasks.mesh_rcnn import shape_losses
 from rendra_lab.tasks.mesh_rcnn.depth_head import DepthHead, extents_of
+from rendra_lab.tasks.mesh_rcnn.losses import depth_extent
 from rendra_lab.tasks.mesh_rcnn.shape_heads import ShapeHeads
 from rendra_lab.tasks.mesh_rcnn.shape_targets import shape_targets
 
@@ -61,6 +60,15 @@ def heads(most_regions: int | None = None) -> ShapeHeads:
         MeshRefinement(6, width=8, stages=2, convs=1, padding_mode="border", align_corners=False),
         points=200, most_regions=most_regions,
     )  # fmt: skip
+
+
+def stage_losses(verdicts: MeshVerdicts) -> Tensor:
+    """As the task weighs them, with fewer points."""
+    return (
+        shape_losses.stage_chamfer(verdicts, 100, "sum")
+        + 0.1 * shape_losses.stage_normals(verdicts, 100, "sum")
+        + shape_losses.stage_edges(verdicts, "sum")
+    )
 
 
 def maps() -> list[Tensor]:
@@ -117,7 +125,7 @@ def test_heads_learn_from_the_first_step_on() -> None:
     assert said.voxels.logits.shape == said.voxels.targets.shape == (2, 8, 8, 8)
     assert len(said.meshes.stages) == 2
     assert bool(said.meshes.is_valid.all())
-    loss = shape_losses.depth(said.depths) + shape_losses.mesh_stages(said.meshes) + said.voxels.logits.square().sum()
+    loss = depth_extent(said.depths) + stage_losses(said.meshes) + said.voxels.logits.square().sum()
     loss.backward()
     assert bool(loss.isfinite())
     learned = {name for name, weight in made.named_parameters() if weight.grad is not None}
@@ -131,7 +139,7 @@ def test_no_region_teaches_nothing_and_every_weight_knows() -> None:
     made = heads()
     said = made.learn(maps(), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), photos(None, torch.zeros(0, 4)))
     assert not bool(said.meshes.is_valid.any())
-    loss = shape_losses.depth(said.depths) + shape_losses.mesh_stages(said.meshes) + said.voxels.logits.sum()
+    loss = depth_extent(said.depths) + stage_losses(said.meshes) + said.voxels.logits.sum()
     assert loss.item() == 0
     loss.backward()
     for name, weight in made.named_parameters():
@@ -169,35 +177,6 @@ def test_found_objects_are_rebuilt_even_where_no_voxel_is() -> None:
     assert len(none.meshes) == 0
 
 
-def stages_of(scale: float, is_valid: list[bool]) -> MeshVerdicts:
-    count, ball = len(is_valid), ico_sphere(3)
-    unit = ball.verts_packed().expand(count, -1, -1)
-    meshes = Meshes([scale * ball.verts_packed()] * count, ball.faces_list() * count)
-    return MeshVerdicts((meshes, meshes), unit, unit, torch.tensor(is_valid))
-
-
-def test_stages_are_summed_and_weighted_as_published() -> None:
-    verdicts = stages_of(2.0, [True, True])
-    apart = shape_losses.mesh_stages(verdicts, chamfer=1.0, normal=0.0, edge=0.0)
-    assert apart.item() == pytest.approx(2 * 2.0, rel=0.03)  # two stages, a squared distance of 1 both ways
-    turned = shape_losses.mesh_stages(verdicts, chamfer=0.0, normal=1.0, edge=0.0)
-    assert 0 <= turned.item() < 0.05
-    short, long = (
-        shape_losses.mesh_stages(stages_of(scale, [True]), chamfer=0.0, normal=0.0, edge=1.0) for scale in (1.0, 3.0)
-    )
-    assert long.item() == pytest.approx(9 * short.item(), rel=1e-4)
-
-
-def test_invalid_meshes_teach_nothing() -> None:
-    one, both = stages_of(2.0, [True]), stages_of(2.0, [True, False])
-    spoilt = replace(both, points=torch.cat([both.points[:1], both.points[1:] + 100]))
-    values = []
-    for verdicts in (one, spoilt):
-        torch.manual_seed(0)
-        values.append(shape_losses.mesh_stages(verdicts).item())
-    assert values[0] == pytest.approx(values[1], rel=1e-5)
-
-
 def test_the_depth_loss_is_a_mean() -> None:
     errors = DepthVerdicts(torch.tensor([0.5, 3.0]), torch.tensor([0.0, 0.0]))
-    assert shape_losses.depth(errors).item() == pytest.approx((0.125 + 2.5) / 2)
+    assert depth_extent(errors).item() == pytest.approx((0.125 + 2.5) / 2)
