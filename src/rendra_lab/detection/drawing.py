@@ -22,6 +22,8 @@ from rendra.renderer.mesh.shader import HardPhongShader, SoftSilhouetteShader
 from rendra.renderer.mesh.textures import TexturesVertex
 from rendra.structures import Meshes, join_meshes_as_scene
 from rendra.utils import cameras_from_opencv_projection
+from rendra_lab.detection.mask_pasting import pasted_masks
+from rendra_lab.detection.records import Detections, PhotoBatch
 from rendra_lab.pictures import Headlight, OrbitCamera, Shading, Studio
 from rendra_lab.visualization import Picture, to_picture
 
@@ -73,6 +75,41 @@ def draw_objects(
         canvas.rectangle((left, top, max(right - 1, left), max(bottom - 1, top)), outline=ink, width=thick)
         _write(canvas, (left, top), text, ink, size, width)
     return np.asarray(page)
+
+
+def panels_of(batch: PhotoBatch, found: Detections, least_score: float = 0.5) -> dict[str, Tensor]:
+    """Pictures of a batch with what was found, and with what is annotated: (B, H, W, 3) each, sRGB in [0, 1].
+
+    Args:
+        batch: pictures and annotations.
+        found: in them.
+        least_score: what is less sure is not drawn.
+    """
+    height, width = batch.rgb.shape[2:]
+    sure = (found.scores >= least_score).nonzero()[:, 0]
+    boxes, masks = found.boxes[sure], None
+    if found.masks is not None:
+        masks = pasted_masks(found.masks[sure], boxes, height, width)
+    captions = [
+        f"{label}: {score:.2f}"
+        for label, score in zip(found.labels[sure].tolist(), found.scores[sure].tolist(), strict=True)
+    ]
+    true = batch.instances
+    names = [str(label) for label in true.labels.tolist()]
+    return {
+        "found": _drawn_on(batch.rgb, found.picture[sure], boxes, captions, masks),
+        "annotated": _drawn_on(batch.rgb, true.picture, true.boxes, names, true.masks),
+    }
+
+
+def _drawn_on(rgb: Tensor, picture: Tensor, boxes: Tensor, captions: Sequence[str], masks: Tensor | None) -> Tensor:
+    pages = []
+    for number, page in enumerate(rgb):
+        rows = (picture == number).nonzero()[:, 0]
+        texts = [captions[row] for row in rows.tolist()]
+        own = None if masks is None else masks[rows]
+        pages.append(draw_objects(to_picture(page.movedim(0, -1)), boxes[rows], texts, own))
+    return torch.from_numpy(np.stack(pages)).to(rgb) / 255
 
 
 def upright(meshes: Meshes) -> Meshes:

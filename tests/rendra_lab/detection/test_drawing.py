@@ -12,10 +12,12 @@ from rendra_lab.detection.drawing import (
     color_of,
     draw_meshes,
     draw_objects,
+    panels_of,
     phong_view,
     silhouette_view,
     upright,
 )
+from rendra_lab.detection.records import Detections, Instances, PhotoBatch
 
 GREY = np.full((60, 80, 3), 128, np.uint8)
 LENS = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]])
@@ -89,3 +91,21 @@ def test_views_from_all_sides() -> None:
         assert (outline[0, 0] == 0).all()
         assert (outline[16, 16] >= 250).all()
         assert lit[16, 16, 2] > lit[16, 16, 0]
+
+
+def test_panels_show_what_is_sure_and_what_is_true() -> None:
+    none = torch.zeros(0, dtype=torch.long)
+    true = Instances(none, torch.zeros(0, 4), none, torch.zeros(0, 60, 80, dtype=torch.bool))
+    batch = PhotoBatch(
+        torch.full((2, 3, 60, 80), 0.5), torch.tensor([[60, 80]] * 2), LENS.repeat(2, 1, 1), true, ["a", "b"]
+    )
+    boxes = torch.tensor([[20.0, 20, 60, 50], [20.0, 20, 60, 50]])
+    found = Detections(
+        torch.tensor([0, 1]), boxes, torch.tensor([2, 3]), torch.tensor([0.9, 0.2]), torch.ones(2, 4, 4)
+    )
+    panels = panels_of(batch, found)
+    assert panels["found"].shape == panels["annotated"].shape == (2, 60, 80, 3)
+    changed = (panels["found"] - 0.5).abs().amax(-1) > 0.01
+    assert bool(changed[0, 25:45, 25:55].all())
+    assert not bool(changed[1].any())
+    assert float((panels["annotated"] - 0.5).abs().max()) < 0.01

@@ -12,6 +12,7 @@ from rendra.utils import ico_sphere
 from rendra_lab import shape_losses
 from rendra_lab.detection.object_frames import depth_extents, depth_ranges
 from rendra_lab.detection.records import DepthVerdicts, Detections, Instances, MeshVerdicts, PhotoBatch
+from rendra_lab.detection.regions import ObjectRegions
 from rendra_lab.detection.roi_align import RoiAlign
 from rendra_lab.errors import UserError
 from rendra_lab.frustums import Frustums
@@ -49,6 +50,12 @@ def photos(shapes: Shapes | None, boxes: Tensor) -> PhotoBatch:
     objects = Instances(zeros, boxes, zeros + 1, torch.zeros(count, 48, 64, dtype=torch.bool), shapes)
     sizes = torch.tensor([[48, 64], [48, 64]])
     return PhotoBatch(torch.zeros(2, 3, 48, 64), sizes, LENS.repeat(2, 1, 1), objects, ["a", "b"])
+
+
+def regions(count: int) -> ObjectRegions:
+    """About the first objects of the first picture."""
+    zeros = torch.zeros(count, dtype=torch.long)
+    return ObjectRegions(zeros, BOXES[:count], zeros + 1, torch.arange(count))
 
 
 def heads(most_regions: int | None = None) -> ShapeHeads:
@@ -121,11 +128,11 @@ def test_heads_learn_from_the_first_step_on() -> None:
     for feature in features:
         feature.requires_grad_()
     batch = photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES)
-    said = made.learn(features, BOXES, torch.tensor([0, 1]), batch)
-    assert said.voxels.logits.shape == said.voxels.targets.shape == (2, 8, 8, 8)
-    assert len(said.meshes.stages) == 2
-    assert bool(said.meshes.is_valid.all())
-    loss = depth_extent(said.depths) + stage_losses(said.meshes) + said.voxels.logits.square().sum()
+    said = made.learn(features, regions(2), batch)
+    assert said["voxels"].logits.shape == said["voxels"].targets.shape == (2, 8, 8, 8)
+    assert len(said["meshes"].stages) == 2
+    assert bool(said["meshes"].is_valid.all())
+    loss = depth_extent(said["depths"]) + stage_losses(said["meshes"]) + said["voxels"].logits.square().sum()
     loss.backward()
     assert bool(loss.isfinite())
     learned = {name for name, weight in made.named_parameters() if weight.grad is not None}
@@ -137,9 +144,9 @@ def test_heads_learn_from_the_first_step_on() -> None:
 
 def test_no_region_teaches_nothing_and_every_weight_knows() -> None:
     made = heads()
-    said = made.learn(maps(), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), photos(None, torch.zeros(0, 4)))
-    assert not bool(said.meshes.is_valid.any())
-    loss = depth_extent(said.depths) + stage_losses(said.meshes) + said.voxels.logits.sum()
+    said = made.learn(maps(), regions(0), photos(None, torch.zeros(0, 4)))
+    assert not bool(said["meshes"].is_valid.any())
+    loss = depth_extent(said["depths"]) + stage_losses(said["meshes"]) + said["voxels"].logits.sum()
     assert loss.item() == 0
     loss.backward()
     for name, weight in made.named_parameters():
@@ -148,15 +155,13 @@ def test_no_region_teaches_nothing_and_every_weight_knows() -> None:
 
 
 def test_few_regions_are_drawn_from_many() -> None:
-    said = heads(most_regions=1).learn(
-        maps(), BOXES, torch.tensor([0, 1]), photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES)
-    )
-    assert len(said.depths.values) == len(said.voxels.logits) == len(said.meshes.stages[0]) == 1
+    said = heads(most_regions=1).learn(maps(), regions(2), photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES))
+    assert len(said["depths"].values) == len(said["voxels"].logits) == len(said["meshes"].stages[0]) == 1
 
 
 def test_objects_without_shapes_are_refused() -> None:
     with pytest.raises(UserError, match="'a' and those beside it have objects without shapes"):
-        heads().learn(maps(), BOXES, torch.tensor([0, 1]), photos(None, BOXES))
+        heads().learn(maps(), regions(2), photos(None, BOXES))
 
 
 def test_found_objects_are_rebuilt_even_where_no_voxel_is() -> None:
@@ -165,8 +170,8 @@ def test_found_objects_are_rebuilt_even_where_no_voxel_is() -> None:
     labels = torch.tensor([1, 0])
     found = Detections(torch.tensor([0, 1]), BOXES, labels, torch.ones(2))
     with torch.no_grad():
-        rebuilt = made.rebuild(maps(), found)
-        none = made.rebuild(maps(), Detections(labels[:0], BOXES[:0], labels[:0], torch.ones(0)))
+        rebuilt = made.describe(maps(), found)
+        none = made.describe(maps(), Detections(labels[:0], BOXES[:0], labels[:0], torch.ones(0)))
     assert rebuilt.meshes is not None
     assert rebuilt.depth_extents is not None
     assert rebuilt.voxels is not None
