@@ -42,6 +42,7 @@ _ALLOWED_FUNCTIONS = (
     "rendra_lab.metrics",
     "rendra_lab.perceptual",
     "rendra_lab.schedulers",
+    "rendra_lab.shape_losses",
     "rendra_lab.tasks.smplify.pose_prior",
     "rendra_lab.tasks.smplify.scores",
     "rendra_lab.tasks.synsin.adversarial_losses",

@@ -7,6 +7,9 @@ columns and rows of a map are x and y, and channels of the last layer are z.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -20,10 +23,10 @@ from rendra_lab.settings import Count, Positive
 class VoxelHead(nn.Module):
     """A column of voxel logits behind each cell of a map: `convs` x (conv 3x3, ReLU), deconv 2x2, ReLU, conv 1x1.
 
-    The paper's heads: 6.764 M weights with 2048 channels in and 48 voxels (ShapeNet), 2.629 M with 256 and 24 (Pix3D).
+    Weights of the paper's heads: 6.764 M for 2048 channels and 48 voxels (ShapeNet), 2.629 M for 256 and 24 (Pix3D).
 
     Args:
-        in_channels: C of the maps.
+        in_channels: C of the map; or of each of several maps, which are put together.
         side: V, even.
         width: channels of the layers between.
         convs: how many convolutions come first.
@@ -36,7 +39,7 @@ class VoxelHead(nn.Module):
 
     def __init__(
         self,
-        in_channels: Positive,
+        in_channels: Positive | Sequence[Positive],
         side: Positive = 48,
         width: Positive = 256,
         convs: Count = 4,
@@ -47,9 +50,10 @@ class VoxelHead(nn.Module):
             raise ValueError(f"the side of a voxel grid must be even, got {side}")
         self.side = side
         self.align_corners = align_corners
-        widths = [in_channels] + [width] * convs
+        self.in_channels = [in_channels] if isinstance(in_channels, int) else list(in_channels)
+        widths = [sum(self.in_channels)] + [width] * convs
         layers: list[nn.Module] = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in pairwise(widths):
             layers += [nn.Conv2d(before, after, 3, padding=1), nn.ReLU()]
         self.layers = nn.Sequential(*layers, nn.ConvTranspose2d(widths[-1], width, 2, stride=2), nn.ReLU())
         self.last = nn.Conv2d(width, side, 1)
@@ -60,14 +64,32 @@ class VoxelHead(nn.Module):
         nn.init.normal_(self.last.weight, std=0.001)
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
-    def forward(self, features: Float[Tensor, "N C H W"]) -> Float[Tensor, "N V V V"]:
-        """Logits of being filled, for maps of objects or of regions."""
+    def forward(
+        self, features: Float[Tensor, "N C H W"] | Sequence[Float[Tensor, "N _ _ _"]]
+    ) -> Float[Tensor, "N V V V"]:
+        """Logits of being filled.
+
+        Args:
+            features: the map; or maps of several resolutions, of which the last ones are read, as many as
+                `in_channels`.
+
+        Raises:
+            ValueError: maps of other channels.
+        """
+        maps = [features] if isinstance(features, Tensor) else list(features)[-len(self.in_channels) :]
+        if [each.shape[1] for each in maps] != self.in_channels:
+            raise ValueError(
+                f"this voxel head reads maps of {self.in_channels} channels, got {[each.shape[1] for each in maps]}"
+            )
+        return self.last(self.layers(torch.cat([self._resized(each) for each in maps], dim=1)))
+
+    def _resized(self, features: Tensor) -> Tensor:
         half = (self.side // 2, self.side // 2)
         if not len(features):
-            features = features.new_zeros(0, features.shape[1], *half)  # interpolation refuses these
-        elif features.shape[-2:] != half:
-            features = F.interpolate(features, half, mode="bilinear", align_corners=self.align_corners)
-        return self.last(self.layers(features))
+            return features.new_zeros(0, features.shape[1], *half)  # interpolation refuses these
+        if features.shape[-2:] == half:
+            return features
+        return F.interpolate(features, half, mode="bilinear", align_corners=self.align_corners)
 
 
 def cubified(logits: Float[Tensor, "N V V V"], threshold: float = 0.2) -> tuple[Meshes, Bool[Tensor, " N"]]:
