@@ -121,7 +121,7 @@ class RoomWorld:
         for _ in range(count):
             place = eye + _free_move(room, eye, move, rng)
             yaw, tip, roll = rng.uniform(-turn, turn, 3)
-            poses.append(_look(place, heading + yaw, pitch + _PITCH_SHARE * tip, _ROLL_SHARE * roll))
+            poses.append(look(place, heading + yaw, pitch + _PITCH_SHARE * tip, _ROLL_SHARE * roll))
         return torch.stack(poses)
 
 
@@ -292,7 +292,7 @@ def _free_move(room: Room, eye: Floats, most: float, rng: _RNG) -> Floats:
     return moves[int(has_clearance(room, eye + moves).argmax())]
 
 
-def _look(eye: Floats, yaw: float, pitch: float, roll: float) -> Tensor:
+def look(eye: Floats, yaw: float, pitch: float, roll: float) -> Tensor:
     """World to camera (4, 4): heading from z to x, pitch upwards, roll about the line of sight; radians."""
     forward = torch.tensor(
         [math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)], dtype=torch.float64

@@ -20,6 +20,8 @@ _GAP = 0.04  # metres between pieces at least
 
 Stock = Callable[[str, np.random.Generator, Finish], Furniture]
 """What gives a piece of a name, of some materials."""
+Tilted = Callable[[Furniture], Floats]
+"""How a piece that does not stand is turned and moved: (4, 4), its lowest point at y = 0."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +119,20 @@ class Furnisher:
         self.placed: list[Placed] = []
         self.lamps: list[Lamp] = []
         self.finish: Finish = draw_finish(rng)
+        self.hung: list[tuple[int, float, float]] = []  # wall, and from where to where along it
         self.taken: list[Floats] = [self._door_way(one) for one in openings if one.kind != "window"]
 
-    def against_wall(self, name: str, topped: tuple[str, ...] = ()) -> Placed | None:
-        """Stands a piece at a wall with its back to it; None where there is no place."""
-        piece = self._draw(name)
-        low, high = piece.bounds()
+    def against_wall(self, name: str, topped: tuple[str, ...] = (), tilted: Tilted | None = None) -> Placed | None:
+        """Stands a piece at a wall with its back to it; None where there is no place.
+
+        Args:
+            name: of the piece.
+            topped: things of which one may be put on it.
+            tilted: how it leans; None: not at all.
+        """
+        piece = self.draw(name)
+        tilt = None if tilted is None else tilted(piece)
+        low, high = Placed.of(piece, (0.0, 0.0, 0.0), tilt=tilt).bounds()
         for _ in range(_TRIES):
             wall = int(self.rng.integers(WALLS))
             origin, yaw, length = wall_frame(wall, self.extent)
@@ -134,14 +144,14 @@ class Furnisher:
             off = 0.03 - low[2]
             x = origin[0] + along * math.cos(yaw) + off * math.sin(yaw)
             z = origin[2] - along * math.sin(yaw) + off * math.cos(yaw)
-            if (stands := self._stand(piece, x, z, yaw)) is not None:
+            if (stands := self._stand(piece, x, z, yaw, tilt=tilt)) is not None:
                 self._put_on_top(piece, stands, topped)
                 return stands
         return None
 
     def in_corner(self, name: str) -> Placed | None:
         """Stands a piece somewhere near the walls, looking towards the middle."""
-        piece = self._draw(name)
+        piece = self.draw(name)
         width, _, depth = self.extent
         for _ in range(_TRIES):
             x, z = self.rng.uniform(0.35, width - 0.35), self.rng.uniform(0.35, depth - 0.35)
@@ -150,6 +160,67 @@ class Furnisher:
             yaw = math.atan2(width / 2 - x, depth / 2 - z) + self.rng.uniform(-0.4, 0.4)
             if (stands := self._stand(piece, x, z, yaw)) is not None:
                 return stands
+        return None
+
+    def lay_down(self, name: str, tilted: Tilted) -> Placed | None:
+        """Lays a piece on the floor, not next to walls."""
+        piece = self.draw(name)
+        tilt = tilted(piece)
+        width, _, depth = self.extent
+        for _ in range(_TRIES):
+            x, z = self.rng.uniform(0.5, width - 0.5), self.rng.uniform(0.5, depth - 0.5)
+            yaw = self.rng.uniform(-math.pi, math.pi)
+            if (lies := self._stand(piece, x, z, yaw, tilt=tilt)) is not None:
+                return lies
+        return None
+
+    def lay_on(self, carrier: Placed, name: str, tilted: Tilted | None = None) -> Placed | None:
+        """Puts a piece anywhere on the top of another one; None where the rest that lies there leaves no place.
+
+        Args:
+            carrier: whose first solid is its top.
+            name: of the piece.
+            tilted: how it lies; None: it stands.
+        """
+        piece = self.draw(name)
+        tilt = None if tilted is None else tilted(piece)
+        low, high = carrier.solids[0].bounds()
+        for _ in range(_TRIES):
+            along, ahead = (self.rng.uniform(0.75 * low[axis], 0.75 * high[axis]) for axis in (0, 2))
+            cos, sin = math.cos(carrier.yaw), math.sin(carrier.yaw)
+            x, z = carrier.place[0] + along * cos + ahead * sin, carrier.place[2] - along * sin + ahead * cos
+            turn = self.rng.uniform(-math.pi, math.pi)
+            thing = Placed.of(piece, (float(x), float(high[1]), float(z)), turn, tilt)
+            least, most = thing.footprint()
+            others = [one.footprint() for one in self.placed if one.place[1] > 0]
+            if not any(bool((least < other[1]).all() and (most > other[0]).all()) for other in others):
+                self.placed.append(thing)
+                return thing
+        return None
+
+    def hang(self, name: str, tilted: Tilted) -> Placed | None:
+        """Hangs a piece on a wall, at the height of the breast."""
+        piece = self.draw(name)
+        tilt = tilted(piece)
+        low, high = Placed.of(piece, (0.0, 0.0, 0.0), tilt=tilt).bounds()
+        for _ in range(_TRIES):
+            wall = int(self.rng.integers(WALLS))
+            origin, yaw, length = wall_frame(wall, self.extent)
+            along, up = self.rng.uniform(0.5, length - 0.5), self.rng.uniform(1.15, 1.6) - float(high[1] - low[1]) / 2
+            left, right = along + low[0] - 0.1, along + high[0] + 0.1
+            if (
+                left < 0
+                or right > length
+                or self._is_hung(wall, left, right)
+                or self._is_behind(wall, left, right, up)
+            ):
+                continue
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            off = 0.005 - float(low[2])
+            place = (origin[0] + along * cos + off * sin, up, origin[2] - along * sin + off * cos)
+            self.hung.append((wall, float(left), float(right)))
+            self.placed.append(Placed.of(piece, place, yaw, tilt))
+            return self.placed[-1]
         return None
 
     def lit_corner(self) -> None:
@@ -168,7 +239,7 @@ class Furnisher:
         self, other: Placed, name: str, gap: float, faces_it: bool = False, with_rug: bool = False
     ) -> Placed | None:
         """Stands a piece before another one."""
-        piece = self._draw(name)
+        piece = self.draw(name)
         front = max(float(solid.bounds()[1, 2]) for solid in other.solids)
         ahead = front + gap - float(piece.bounds()[0, 2])
         x = other.place[0] + ahead * math.sin(other.yaw)
@@ -180,7 +251,7 @@ class Furnisher:
 
     def beside(self, other: Placed, name: str, side: int, topped: tuple[str, ...]) -> None:
         """Stands a piece beside another one, back to back with it."""
-        piece = self._draw(name)
+        piece = self.draw(name)
         bounds = np.stack([solid.bounds() for solid in other.solids])
         low, high = bounds[:, 0].min(0), bounds[:, 1].max(0)
         mine = piece.bounds()
@@ -191,9 +262,9 @@ class Furnisher:
         if (stands := self._stand(piece, float(x), float(z), other.yaw)) is not None:
             self._put_on_top(piece, stands, topped)
 
-    def table_with_chairs(self) -> None:
-        """Stands a table in the middle, chairs about it and perhaps a rug under it."""
-        piece, chair = self._draw("table"), self._draw("chair")
+    def table_with_chairs(self, empty: float = 0.12) -> None:
+        """Stands a table in the middle, chairs about it and perhaps a rug under it; a share of the seats is empty."""
+        piece, chair = self.draw("table"), self.draw("chair")
         width, _, depth = self.extent
         turn = math.pi / 2 * int(depth > width)
         x, z = (side / 2 + self.rng.uniform(-0.3, 0.3) for side in (width, depth))
@@ -208,7 +279,7 @@ class Furnisher:
         seats += [(share * right, back, 0.0) for share in (-0.5, 0.5)]
         seats += [(left, 0.0, math.pi / 2), (right, 0.0, -math.pi / 2)]
         for along, ahead, yaw in seats:
-            if self.rng.random() < 0.12:
+            if self.rng.random() < empty:
                 continue
             out = self.rng.uniform(0.02, 0.35)
             along, ahead = along - out * math.sin(yaw), ahead - out * math.cos(yaw)
@@ -231,18 +302,16 @@ class Furnisher:
         """Hangs paintings where walls are free at the height of the eyes."""
         frame = wood_color(self.rng) if self.rng.random() < 0.6 else np.full(3, self.rng.choice([0.1, 0.92]))
         color = (float(frame[0]), float(frame[1]), float(frame[2]))
-        hung: list[tuple[int, float, float]] = []
         for number in range(count):
             wall = int(self.rng.integers(WALLS))
             origin, yaw, length = wall_frame(wall, self.extent)
             wide, tall = self.rng.uniform(0.3, 1.0), self.rng.uniform(0.3, 0.8)
             along, up = self.rng.uniform(0.7, length - 0.7), self.rng.uniform(1.45, 1.7)
             left, right = along - wide / 2 - 0.1, along + wide / 2 + 0.1
-            is_free = not any(one == wall and left < end and right > start for one, start, end in hung)
-            if is_free and not self._is_behind(wall, left, right, up - tall / 2):
+            if not self._is_hung(wall, left, right) and not self._is_behind(wall, left, right, up - tall / 2):
                 picture = hung_picture((along, up), (wide, tall), number % NUM_PAINTINGS, color)
                 self.placed.append(Placed(tuple(picture), origin, yaw))
-                hung.append((wall, left, right))
+                self.hung.append((wall, left, right))
 
     def hang_lamp(self) -> None:
         """Hangs a lamp in the middle of the ceiling; in one of five rooms it is off."""
@@ -258,14 +327,16 @@ class Furnisher:
         if is_on:
             self.lamps.append(Lamp((x, height - drop - 0.12, z), _warm(self.rng, 1.0)))
 
-    def _draw(self, name: str) -> Furniture:
+    def draw(self, name: str) -> Furniture:
         """A piece, mostly of the materials of the room."""
         finish = self.finish if self.rng.random() < 0.65 else draw_finish(self.rng)
         return self.stock(name, self.rng, replace(finish, cover_color=draw_finish(self.rng).cover_color))
 
-    def _stand(self, piece: Furniture, x: float, z: float, yaw: float, close: bool = False) -> Placed | None:
+    def _stand(
+        self, piece: Furniture, x: float, z: float, yaw: float, close: bool = False, tilt: Floats | None = None
+    ) -> Placed | None:
         """Stands a piece at a place if it is free; chairs may reach under tables."""
-        placed = Placed.of(piece, (float(x), 0.0, float(z)), yaw)
+        placed = Placed.of(piece, (float(x), 0.0, float(z)), yaw, tilt)
         (left, back), (right, front) = placed.footprint()
         width, _, depth = self.extent
         if left < 0.02 or back < 0.02 or right > width - 0.02 or front > depth - 0.02:
@@ -288,7 +359,7 @@ class Furnisher:
         x = stands.place[0] + along * math.cos(stands.yaw)
         z = stands.place[2] - along * math.sin(stands.yaw)
         top = max(float(solid.bounds()[1, 1]) for solid in stands.solids[:1]) if piece.kind != "desk" else high[1]
-        thing = Placed.of(self._draw(name), (x, float(top), z), stands.yaw)
+        thing = Placed.of(self.draw(name), (x, float(top), z), stands.yaw)
         self.placed.append(thing)
         if name == "table lamp":
             self.lamps.append(Lamp((x, thing.height() + 0.04, z), _warm(self.rng, 0.2)))
@@ -307,6 +378,10 @@ class Furnisher:
             one.wall == wall and left < one.right + 0.1 and right > one.left - 0.1 and top > one.low + 0.05
             for one in self.openings
         )
+
+    def _is_hung(self, wall: int, left: float, right: float) -> bool:
+        """Whether something hangs at a stretch of a wall."""
+        return any(one == wall and left < end and right > start for one, start, end in self.hung)
 
     def _is_behind(self, wall: int, left: float, right: float, low: float) -> bool:
         """Whether a stretch of a wall above a height is covered: by an opening, or by what stands before it."""

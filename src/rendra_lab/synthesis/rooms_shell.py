@@ -97,10 +97,14 @@ class Placed:
         matrix[:3, 3] = self.place
         return matrix if self.tilt is None else (matrix @ self.tilt).astype(np.float32)
 
+    def bounds(self) -> Floats:
+        """The least and the greatest coordinates in the axes of the solids: (2, 3)."""
+        bounds = np.stack([solid.bounds() for solid in self.solids])
+        return np.stack([bounds[:, 0].min(0), bounds[:, 1].max(0)])
+
     def footprint(self) -> Floats:
         """Least x and z and greatest x and z: (2, 2)."""
-        bounds = np.stack([solid.bounds() for solid in self.solids])
-        (left, _, back), (right, _, front) = bounds[:, 0].min(0), bounds[:, 1].max(0)
+        (left, _, back), (right, _, front) = self.bounds()
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         corners = np.array([[x, z] for x in (left, right) for z in (back, front)])
         turned = corners @ np.array([[cos, -sin], [sin, cos]]) + (self.place[0], self.place[2])
