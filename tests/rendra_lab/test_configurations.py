@@ -55,6 +55,7 @@ _OF_SAMPLERS = {
     "stratified": ("sampler.samples=6",),
 }
 SMALLER = {
+    "synsin_paper": (*_FEW_PAIRS, "network.depth.levels=6", "renderer.points_per_pixel=8"),
     "volume_book": (*_SMALL_SCENE, *_OF_VOLUMES["book"]),
     "nerf_book": (*_TINY, "sampler.samples=4"),
     "nerf_book_laptop": (*_TINY, "sampler.samples=4"),

@@ -14,7 +14,9 @@ from torch import Tensor, nn
 from rendra_lab.errors import UserError
 from rendra_lab.networks.spectral_blocks import Resample, ResidualChain
 from rendra_lab.settings import Amount, Count, Positive
+from rendra_lab.tasks.synsin.hole_filling import filled
 
+_LEAST_COVER = 1e-3  # of a pixel: where there is less, the colour is nobody's
 _TRUST = 2.0  # how much an untrained decoder keeps of the colours that it is given, before a sigmoid
 
 
@@ -25,7 +27,7 @@ class FeatureEncoder(nn.Module):
         widths: channels behind each residual block.
         resample: of each block, see `ResidualChain`.
         fold: the blocks see squares of `fold` x `fold` pixels as one, with more channels.
-        keep_color: the first three features are the picture itself, beside what the blocks make of it.
+        keep_color: the first four features are the picture itself and 1, beside what the blocks make of it.
         noise_seed, noise_std: see `NoiseBatchNorm`.
 
     `channels` is how many features a pixel has.
@@ -44,14 +46,14 @@ class FeatureEncoder(nn.Module):
         if not widths or widths[-1] % fold**2:
             raise UserError(f"the last of the encoder's widths must be a multiple of fold^2 = {fold**2}: {widths}")
         self.keep_color = keep_color
-        self.channels = widths[-1] // fold**2 + 3 * keep_color
+        self.channels = widths[-1] // fold**2 + 4 * keep_color
         self.chain = ResidualChain(3 * fold**2, widths, resample, 2 * noise_seed, noise_std, fold)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Features (B, C, H, W) of pictures (B, 3, H, W)."""
         inner = 2 * pictures - 1
         features = self.chain(inner)
-        return torch.cat([inner, features], 1) if self.keep_color else features
+        return torch.cat([inner, torch.ones_like(inner[:, :1]), features], 1) if self.keep_color else features
 
 
 class RefinementDecoder(nn.Module):
@@ -62,8 +64,9 @@ class RefinementDecoder(nn.Module):
         widths: channels behind each residual block but the last, which gives the picture.
         resample: of each block, the last included, see `ResidualChain`.
         fold: the blocks see squares of `fold` x `fold` pixels as one, with more channels.
-        keep_color: the first three features are colours, as `FeatureEncoder` keeps them; a fourth channel of the
-            last layer says at each pixel how much of them stays, and the tanh paints the rest.
+        keep_color: the first four features are colours and how much of a pixel they cover, as `FeatureEncoder`
+            keeps them. Holes take the colours about them; a fourth channel of the last layer says at each pixel how
+            much of that stays, and the tanh paints the rest.
         noise_seed, noise_std: see `NoiseBatchNorm`.
     """
 
@@ -78,8 +81,8 @@ class RefinementDecoder(nn.Module):
         noise_std: Amount = 1.0,
     ) -> None:
         super().__init__()
-        if keep_color and channels < 3:
-            raise UserError(f"a decoder that keeps colours needs channels of at least 3, got {channels}")
+        if keep_color and channels < 4:
+            raise UserError(f"a decoder that keeps colours needs channels of at least 4, got {channels}")
         self.channels = channels
         self.keep_color = keep_color
         outer = [*widths, (4 if keep_color else 3) * fold**2]
@@ -94,9 +97,10 @@ class RefinementDecoder(nn.Module):
         """
         if features.ndim != 4 or features.shape[1] != self.channels:
             raise ValueError(f"a decoder of {self.channels} features got {tuple(features.shape)}")
-        answer = self.chain(features)
-        picture = torch.tanh(answer[:, :3])
-        if self.keep_color:
-            given = features[:, :3].clamp(-1, 1)  # sums of splats may be brighter than any colour
-            picture = torch.lerp(picture, given, torch.sigmoid(answer[:, 3:] + _TRUST))
+        if not self.keep_color:
+            return 0.5 * torch.tanh(self.chain(features)) + 0.5
+        cover = features[:, 3:4]
+        given = filled((features[:, :3] / cover.clamp_min(_LEAST_COVER)).clamp(-1, 1), cover.clamp(0, 1))
+        answer = self.chain(torch.cat([given, features[:, 3:]], 1))
+        picture = torch.lerp(torch.tanh(answer[:, :3]), given, torch.sigmoid(answer[:, 3:] + _TRUST))
         return 0.5 * picture + 0.5

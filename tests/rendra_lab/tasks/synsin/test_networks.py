@@ -39,7 +39,7 @@ def test_the_published_sizes() -> None:
 
 def test_the_small_ones_have_every_part_and_fit_together() -> None:
     parts = networks("small")
-    assert sum(sizes(parts[name]) for name in ("encoder", "depth", "decoder")) == 601_725
+    assert sum(sizes(parts[name]) for name in ("encoder", "depth", "decoder")) == 602_845
     assert sizes(parts["discriminator"]) == 85_538
     pictures = torch.rand(2, 3, 64, 64)
     features, depth = parts["encoder"](pictures), parts["depth"](pictures)
@@ -68,11 +68,16 @@ def test_kept_colours_go_first_and_come_out_again() -> None:
     pictures = torch.rand(2, 3, 8, 8)
     encoder = FeatureEncoder([8, 8], fold=2, keep_color=True)
     features = encoder(pictures)
-    assert features.shape == (2, 5, 8, 8) == (2, encoder.channels, 8, 8)
+    assert features.shape == (2, 6, 8, 8) == (2, encoder.channels, 8, 8)
     assert_close(features[:, :3], 2 * pictures - 1)
-    decoder = RefinementDecoder(5, [8], None, fold=2, keep_color=True)
+    assert bool((features[:, 3] == 1).all())
+    decoder = RefinementDecoder(6, [8], None, fold=2, keep_color=True)
     nn.init.constant_(decoder.chain.blocks[-1].shortcut.bias, 50.0)  # keep all
     assert_close(decoder(features), pictures, atol=1e-6)
+    holes = features.clone()
+    holes[..., 3:5] = 0
+    assert_close(decoder(holes)[..., :3], pictures[..., :3], atol=1e-6)
+    assert 0.1 < float((decoder(holes)[..., 3:5] / pictures[..., 3:5].mean()).detach().mean()) < 2
     nn.init.constant_(decoder.chain.blocks[-1].shortcut.bias, -50.0)  # paint all, and that black
     assert_close(decoder(features), torch.zeros_like(pictures), atol=1e-6)
     loud = torch.full_like(features, 40.0)
@@ -92,7 +97,7 @@ def test_two_networks_of_one_seed_have_different_noise_and_evaluation_repeats() 
 def test_settings_that_do_not_fit_are_refused() -> None:
     with pytest.raises(UserError, match=r"multiple of fold\^2 = 4"):
         FeatureEncoder([8, 9], fold=2)
-    with pytest.raises(UserError, match="channels of at least 3, got 2"):
+    with pytest.raises(UserError, match="channels of at least 4, got 2"):
         RefinementDecoder(2, [8], None, keep_color=True)
     with pytest.raises(ValueError, match=r"decoder of 8 features got \(1, 7, 4, 4\)"):
         RefinementDecoder(8, [8], None)(torch.zeros(1, 7, 4, 4))
