@@ -68,18 +68,30 @@ class Frustums(TensorRecord):
 
     def voxels_of(self, shapes: Shapes, side: int, samples: int = 2) -> Bool[Tensor, "N side side side"]:
         """The grid over each frustum, [z, y, x]: filled where any of samples^3 places of a cell is in the object."""
-        ticks = (torch.arange(side * samples, device=self.boxes.device) + 0.5) * (2 / (side * samples)) - 1
-        z, y, x = torch.meshgrid(ticks, ticks, ticks, indexing="ij")
-        places = torch.stack([x, y, z], dim=-1).reshape(1, -1, 3).to(self.boxes)
-        full = torch.stack([
-            _is_inside(self._one(index).to_camera(places)[0], shapes.voxels[index], shapes.voxels_to_camera[index])
-            for index in range(len(self.boxes))
-        ]) if len(self.boxes) else self.boxes.new_zeros((0, places.shape[1]), dtype=torch.bool)  # fmt: skip
-        cells = full.reshape(-1, side, samples, side, samples, side, samples)
+        full = [
+            _filled(matrix, voxels, side * samples)
+            for matrix, voxels in zip(self._to_own_axes(shapes.voxels_to_camera), shapes.voxels, strict=True)
+        ]
+        if not full:
+            return torch.zeros(0, side, side, side, dtype=torch.bool, device=self.boxes.device)
+        cells = torch.stack(full).reshape(-1, side, samples, side, samples, side, samples)
         return cells.any(6).any(4).any(2)
 
-    def _one(self, index: int) -> Frustums:
-        return Frustums(*(values[index : index + 1] for values in (self.boxes, self.depth_range, self.intrinsics)))
+    def _to_own_axes(self, voxels_to_camera: Tensor) -> Tensor:
+        """Columns: a point (x', y', z', 1) of each frame to a multiple of (x, y, z, 1) in its object's cube. (N, 4, 4)
+
+        A point of the camera's axes over its depth, (x / z, y / z, 1, 1 / z), is linear in the frame.
+        """
+        low, size = (part[:, 0].double() for part in self._corner_and_size())
+        focal, center = (part[:, 0].double() for part in self._lens())
+        near, far = self.depth_range.double().unbind(-1)
+        matrix = low.new_zeros(len(low), 4, 4)
+        matrix[:, [0, 1], [0, 1]] = size / 2 / focal
+        matrix[:, :2, 3] = (low + size / 2 - center) / focal
+        matrix[:, 2, 3] = 1
+        matrix[:, 3, 2] = (1 / far - 1 / near) / 2
+        matrix[:, 3, 3] = (1 / near + 1 / far) / 2
+        return (torch.linalg.inv(voxels_to_camera.double()) @ matrix).to(self.boxes)
 
     def _corner_and_size(self) -> tuple[Tensor, Tensor]:
         low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
@@ -90,12 +102,17 @@ class Frustums(TensorRecord):
         return focal[:, None], self.intrinsics[:, None, :2, 2]
 
 
-def _is_inside(points: Tensor, voxels: Tensor, voxels_to_camera: Tensor) -> Tensor:
-    """Whether points (P, 3) in the camera's axes lie in filled voxels (V, V, V) of one object."""
-    inverse = torch.linalg.inv(voxels_to_camera.double()).to(points)
-    own = points @ inverse[:3, :3].T + inverse[:3, 3]
-    side = voxels.shape[0]
-    cell = ((own + 1) * (side / 2)).floor().long()
-    is_within = ((cell >= 0) & (cell < side)).all(-1)
-    x, y, z = cell.clamp(0, side - 1).unbind(-1)
-    return is_within & voxels.reshape(-1)[(z * side + y) * side + x]
+def _filled(matrix: Tensor, voxels: Tensor, side: int) -> Tensor:
+    """Which of side^3 places of a frame lie in filled voxels (V, V, V) of one object: (side, side, side)."""
+    ticks = (torch.arange(side, device=matrix.device) + 0.5).to(matrix) * (2 / side) - 1
+    x, y, z = ticks, ticks[:, None], ticks[:, None, None]
+    count = voxels.shape[0]
+    to_cells = (count / 2) / (matrix[3, 2] * z + matrix[3, 3])  # below the line is 1 / depth
+    within = torch.ones((side, side, side), dtype=torch.bool, device=matrix.device)
+    index = matrix.new_zeros(side, side, side)
+    for row in (matrix[2], matrix[1], matrix[0]):  # z, y, x
+        rest = (row[1] * y + (row[2] * z + row[3])) * to_cells + count / 2  # small: without x
+        cell = (row[0] * to_cells * x + rest).floor()
+        within &= (cell >= 0) & (cell < count)
+        index = index * count + cell
+    return within & voxels.reshape(-1)[torch.where(within, index, 0.0).long()]
