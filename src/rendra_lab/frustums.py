@@ -78,7 +78,7 @@ class Frustums(TensorRecord):
         return cells.any(6).any(4).any(2)
 
     def _to_own_axes(self, voxels_to_camera: Tensor) -> Tensor:
-        """Columns: a point (x', y', z', 1) of each frame to a multiple of (x, y, z, 1) in its object's cube. (N, 4, 4)
+        """Columns: a point (x', y', z', 1) of each frame to a multiple of (x, y, z, 1) in its object's cube.
 
         A point of the camera's axes over its depth, (x / z, y / z, 1, 1 / z), is linear in the frame.
         """
