@@ -40,6 +40,17 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         table.writerows(rows)
 
 
+def markdown_table(table: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose first row is its head; columns stand below each other, the first to the left."""
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+    padded = [
+        [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        for row in table
+    ]
+    return [f"| {' | '.join(line)} |" for line in (padded[0], rule, *padded[1:])]
+
+
 def say(line: str) -> None:
     """One line for whoever watches a run, at once."""
     sys.stdout.write(f"{line}\n")

@@ -127,6 +127,8 @@ class AveragePrecision(Metric):
         self, detections: Detections, instances: Instances, intrinsics: Tensor | None
     ) -> Iterator[tuple[PictureOverlaps, Agreement]]:
         """The pictures with the overlaps of their boxes, and what says how far objects agree."""
+        if not len(instances.labels):
+            return
         boxes = overlaps_of("box", detections, instances)
         if self.kind == "mesh":
             meshes = MeshAgreement(detections, instances, intrinsics, self.samples)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from rendra_lab.metrics import Scores
+from rendra_lab.report import markdown_table
 from rendra_lab.tasks.synsin.records import PairBatch, ViewPrediction
 from rendra_lab.tasks.synsin.scores import REGIONS, DepthMeasure, depth_scores, measures, view_scores
 
@@ -77,7 +78,9 @@ def results(rows: Sequence[Row], constant_depth: float | None) -> str:
     depths = {measure: means.get(f"depth_{measure}") for measure in get_args(DepthMeasure)}
     blank = [""] * (len(titles) - 1)
     table += [[f"depth {name}", formatted(name, cell), *blank] for name, cell in depths.items() if cell is not None]
-    return "\n".join([f"# {len(rows)} new views", "", *_markdown(table), "", *_notes(rows, constant_depth)]) + "\n"
+    return (
+        "\n".join([f"# {len(rows)} new views", "", *markdown_table(table), "", *_notes(rows, constant_depth)]) + "\n"
+    )
 
 
 def column_name(method: str, measure: str, region: str = "whole") -> str:
@@ -102,17 +105,6 @@ def _view_columns(views: Mapping[str, Tensor], batch: PairBatch) -> Iterator[tup
             for region in regions:
                 scores = view_scores(rgb, batch.target, truth=batch.truth, measure=measure, region=region)
                 yield column_name(method, measure, region), scores
-
-
-def _markdown(table: Sequence[Sequence[str]]) -> list[str]:
-    """Lines whose columns stand below each other: the first to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-    padded = [
-        [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        for row in table
-    ]
-    return [f"| {' | '.join(line)} |" for line in (padded[0], rule, *padded[1:])]
 
 
 def _notes(rows: Sequence[Row], constant_depth: float | None) -> list[str]:
