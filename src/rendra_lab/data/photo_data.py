@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -191,7 +191,7 @@ def joined(photos: Sequence[PhotoBatch]) -> PhotoBatch:
         boxes=torch.cat([each.boxes for each in seen]),
         labels=torch.cat([each.labels for each in seen]),
         masks=torch.cat([_filled_up(each.masks, height, width) for each in seen]),
-        shapes=_joined_shapes(seen),
+        shapes=_shapes_of_all(seen),
     )
     return PhotoBatch(
         rgb=torch.cat([_filled_up(photo.rgb, height, width) for photo in photos]),
@@ -207,20 +207,30 @@ def _filled_up(pictures: Tensor, height: int, width: int) -> Tensor:
     return F.pad(pictures, (0, right, 0, below)) if below or right else pictures
 
 
-def _joined_shapes(seen: Sequence[Instances]) -> Shapes | None:
+def _shapes_of_all(seen: Sequence[Instances]) -> Shapes | None:
     """Those of all objects; None where no objects have any."""
     known = [each.shapes for each in seen if each.shapes is not None]
     if not known:
         return None
     if any(each.shapes is None and len(each.boxes) for each in seen):
         raise ValueError("some objects of a batch have shapes and others have none")
-    known = [shapes for shapes in known if len(shapes.points)] or known[:1]  # no objects: of whatever sizes
+    return joined_shapes([shapes for shapes in known if len(shapes.points)] or known[:1])  # no objects: any sizes
+
+
+def joined_shapes(several: Sequence[Shapes]) -> Shapes:
+    """All objects of some, which have as many points and cells.
+
+    Raises:
+        ValueError: none.
+    """
+    if not several:
+        raise ValueError("no shapes to join")
 
     def column(name: str) -> Tensor:
-        return torch.cat([getattr(shapes, name) for shapes in known])
+        return torch.cat([getattr(shapes, name) for shapes in several])
 
-    def row(get: Callable[[Shapes], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        return tuple(each for shapes in known for each in get(shapes))
-
-    tensors = {name: column(name) for name in ("points", "normals", "voxels", "voxels_to_camera")}
-    return Shapes(**tensors, verts=row(lambda shapes: shapes.verts), faces=row(lambda shapes: shapes.faces))
+    return Shapes(
+        **{name: column(name) for name in ("points", "normals", "voxels", "voxels_to_camera")},
+        verts=tuple(verts for shapes in several for verts in shapes.verts),
+        faces=tuple(faces for shapes in several for faces in shapes.faces),
+    )

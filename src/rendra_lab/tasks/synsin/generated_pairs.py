@@ -4,32 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from time import perf_counter
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rendra_lab import report
+from rendra_lab.data.announced import announced
 from rendra_lab.data.kept_tensors import Tensors, kept_or_made
 from rendra_lab.errors import UserError
-from rendra_lab.progress import clock_time
 from rendra_lab.settings import Count, Positive, Range, check_numbers
 from rendra_lab.synthesis.posed_views import PosedViews, World, seen_by
 from rendra_lab.tasks.synsin.pair_data import PairData, PairSplits
 from rendra_lab.tasks.synsin.records import PairBatch, PairTruth
 
 _SPLITS = ("train", "val", "test")
-_LINE_S = 10.0  # between lines of progress
-_PATIENCE_S = 3.0  # what takes no longer is not worth a line
 
 _Views = Annotated[int, Range(2, 64)]
-
-T = TypeVar("T")
 
 
 class GeneratedPairs(PairData):
@@ -92,7 +86,8 @@ class GeneratedPairs(PairData):
     def load(self) -> PairSplits:
         """All places, rendered or from the cache."""
         total = sum(self.counts.values())
-        places = _announced((self._views(split, i) for split in _SPLITS for i in range(self.counts[split])), total)
+        made = (self._views(split, i) for split in _SPLITS for i in range(self.counts[split]))
+        places = announced(made, total, "generated places")
         parts = {split: list(itertools.islice(places, self.counts[split])) for split in _SPLITS}
         return PairSplits(
             train=ViewPairs(parts["train"], with_truth=self.truth_in_training),
@@ -177,19 +172,6 @@ def _packed(views: PosedViews) -> Tensors:
     """What is kept of views: depth in half of the bits, to a part in 2000."""
     kept: dict[str, Tensor] = {name: getattr(views, name) for name in PosedViews.names()}
     return {**kept, "depth": views.depth.half()}
-
-
-def _announced(places: Iterable[T], total: int) -> Iterator[T]:
-    """The same; says now and then how many there are, where it takes long."""
-    begin = last = perf_counter()
-    for done, place in enumerate(places, 1):
-        yield place
-        now = perf_counter()
-        is_last = done == total
-        if now - last >= _LINE_S or (is_last and now - begin >= _PATIENCE_S):
-            left = "" if is_last else f", {clock_time((now - begin) / done * (total - done))} left"
-            report.say(f"generated places {done}/{total} in {clock_time(now - begin)}{left}")
-            last = now
 
 
 def _version(package: str) -> str:
