@@ -49,8 +49,3 @@ def cells(verdicts: CellVerdicts) -> Tensor:
     """Binary cross-entropy of the cells of masks or voxels, their mean over cells and regions with an object."""
     total = F.binary_cross_entropy_with_logits(verdicts.logits, verdicts.targets, reduction="sum")
     return total / max(verdicts.logits.numel(), 1)
-
-
-def region_accuracy(verdicts: BoxVerdicts) -> Tensor:
-    """The share of regions whose class, or that they are background, was told right; NaN where none was drawn."""
-    return (verdicts.logits.argmax(1) == verdicts.labels).float().mean()

@@ -17,6 +17,7 @@ from rendra_lab.detection.box_head import BoxHead
 from rendra_lab.detection.proposals import RegionProposals
 from rendra_lab.detection.records import Detections, DetectorPrediction, PhotoBatch
 from rendra_lab.detection.regions import Maps, ObjectRegions, RegionSampler
+from rendra_lab.errors import UserError
 from rendra_lab.networks.feature_pyramid import FeaturePyramid
 
 
@@ -52,6 +53,9 @@ class TwoStageDetector(nn.Module):
         sampler: draws the regions that heads learn from.
         box: says what stands in a region, and where exactly.
         heads: `RegionHead`s by name; in evaluation each is handed the detections that the one before it gave.
+
+    Raises:
+        UserError: a pyramid of other channels than the backbone's.
     """
 
     def __init__(
@@ -64,6 +68,11 @@ class TwoStageDetector(nn.Module):
         heads: Mapping[str, nn.Module] | None = None,
     ) -> None:
         super().__init__()
+        made = tuple(getattr(backbone, "channels", pyramid.channels))
+        if made != pyramid.channels:
+            raise UserError(
+                f"the backbone makes maps of {made} channels, the feature pyramid takes {pyramid.channels}"
+            )
         self.backbone = backbone
         self.pyramid = pyramid
         self.proposals = proposals
@@ -83,7 +92,12 @@ class TwoStageDetector(nn.Module):
         return self.pyramid(self.backbone(pictures))
 
     def learn(self, levels: tuple[Tensor, ...], batch: PhotoBatch) -> DetectorPrediction:
-        """What all parts say, beside the truth."""
+        """What all parts say, beside the truth.
+
+        Raises:
+            UserError: an annotated object of a class that the box head does not have.
+        """
+        self._check_labels(batch)
         answers = self.proposals(levels)
         proposed = self.proposals.chosen(answers, batch.sizes)
         regions = self.sampler(proposed, batch.instances, len(batch.rgb))
@@ -105,6 +119,14 @@ class TwoStageDetector(nn.Module):
         for head in self._heads():
             found = head.describe(maps, found)
         return found
+
+    def _check_labels(self, batch: PhotoBatch) -> None:
+        labels = batch.instances.labels
+        if len(labels) and int(labels.max()) >= self.box.classes:
+            raise UserError(
+                f"the pictures {', '.join(batch.picture_ids)} show an object of class {int(labels.max())}, counted "
+                f"from 0, and the network knows {self.box.classes}: network.classes must be as many as the data have"
+            )
 
     def _heads(self) -> list[RegionHead]:
         return [cast(RegionHead, head) for head in self.heads.values()]

@@ -25,7 +25,7 @@ class FeaturePyramid(nn.Module):
 
     def __init__(self, channels: Sequence[Positive], width: Positive = 256, norm: Norm = "none") -> None:
         super().__init__()
-        self.width = width
+        self.channels, self.width = tuple(channels), width
         self.lateral = nn.ModuleList(_convolution(before, width, 1, norm) for before in channels)
         self.output = nn.ModuleList(_convolution(width, width, 3, norm) for _ in channels)
 
