@@ -26,7 +26,7 @@ from rendra_lab.mesh_scores import true_meshes
 from rendra_lab.settings import Count, Fraction
 from rendra_lab.visualization import Picture
 
-_ROW_PX = 192  # least height of the pictures of a row
+_ROW_PX = 256  # height that small pictures are about enlarged to, so that their captions can be read
 _SIDE_PX = 192  # of a view of a mesh
 _UNKNOWN_DEPTH = 2.0  # where nobody can say how far an object is: of its size alone
 _TWO_SIDES = ("as photographed", "from the left")
@@ -124,7 +124,7 @@ class DetectionReport(Callback):
 
     def _draw(self, number: int, scene: _Scene) -> None:
         shown = scene.pictures(self._classes)
-        row = visualization.captioned_row(shown, max(_ROW_PX, *(len(picture) for picture in shown.values())))
+        row = visualization.captioned_row(shown, max(len(picture) for picture in shown.values()))
         visualization.save_picture(self.folder / "detections" / f"{number:04d}.png", row)
         self._rows.append(row)
         for i in range(min(scene.num_meshes, self.most_meshes)):
@@ -193,18 +193,22 @@ class _Scene:
     def pictures(self, classes: Sequence[str]) -> dict[str, Picture]:
         """What is annotated, what is found, and its meshes where they are seen."""
         height, width = self.picture.shape[:2]
-        squares = self.found.masks
-        masks = None if squares is None else pasted_masks(squares, self.found.boxes, height, width)
+        zoom = max(1, round(_ROW_PX / height))
+        picture = visualization.resize(self.picture, zoom * height)
+        squares, boxes = self.found.masks, zoom * self.found.boxes
+        masks = None if squares is None else pasted_masks(squares, boxes, zoom * height, zoom * width)
+        true_masks = self.truth.masks.repeat_interleave(zoom, 1).repeat_interleave(zoom, 2)
         names = [class_name(classes, label) for label in self.truth.labels.tolist()]
         said = [self.caption(classes, i) for i in range(len(self.found.labels))]
         # found objects have the colours of the annotated ones that they are on
         colors = [color_of(true if true >= 0 else len(names) + i) for i, true in enumerate(self.partners)]
         shown = {
-            "annotated": draw_objects(self.picture, self.truth.boxes, names, self.truth.masks[:, :height, :width]),
-            "found": draw_objects(self.picture, self.found.boxes, said, masks, colors),
+            "annotated": draw_objects(picture, zoom * self.truth.boxes, names, true_masks),
+            "found": draw_objects(picture, boxes, said, masks, colors),
         }
         if self.num_meshes:
-            shown["rebuilt"] = draw_meshes(self.picture, self.meshes, self.lens, colors)
+            zoomed = self.lens * self.lens.new_tensor([[zoom], [zoom], [1]])
+            shown["rebuilt"] = draw_meshes(picture, self.meshes, zoomed, colors)
         return shown
 
     def mesh_pictures(self, index: int) -> dict[str, Picture]:
@@ -230,10 +234,11 @@ class _Scene:
 def _of_picture(found: Detections, batch: PhotoBatch, index: int, least_score: float) -> _Scene:
     height, width = batch.sizes[index].tolist()
     of_it = (found.picture == index) & (found.scores >= least_score)
+    truth = _annotated(batch.instances, (batch.instances.picture == index).nonzero()[:, 0])
     return _Scene(
         batch.rgb[index, :, :height, :width],
         _chosen(found, of_it.nonzero()[:, 0]),
-        _annotated(batch.instances, (batch.instances.picture == index).nonzero()[:, 0]),
+        replace(truth, masks=truth.masks[:, :height, :width]),
         batch.intrinsics[index],
     )
 

@@ -26,7 +26,7 @@ from rendra_lab.tasks.voxmesh.records import ShapePrediction
 from rendra_lab.tasks.voxmesh.shape_table import Row, class_means_of, means_of, numbers_of, results
 from rendra_lab.visualization import Picture
 
-_PICTURE_PX = 160
+_PICTURE_PX = 192
 _BLUE: Color = (0.25, 0.5, 0.85)
 _GREY: Color = (0.72, 0.72, 0.72)
 _OTHER_SIDE = "from behind"
@@ -158,7 +158,9 @@ def pictures_of(mesh: Meshes, truth: Meshes, batch: ShapeBatch, index: int) -> d
         index: of the object.
     """
     photograph = visualization.to_picture(batch.rgb[index].movedim(0, -1))
-    paper = np.full_like(photograph, 255)
+    zoom = max(1, round(_PICTURE_PX / len(photograph)))
+    paper = np.full_like(visualization.resize(photograph, zoom * len(photograph)), 255)
+    lens = batch.intrinsics[index] * batch.intrinsics.new_tensor([[zoom], [zoom], [1]])
     center, radius = bounding_sphere(upright(truth))
     view = SIDES[_OTHER_SIDE]
     # both are seen from one place: as far as the truth fits with a little around it
@@ -166,14 +168,14 @@ def pictures_of(mesh: Meshes, truth: Meshes, batch: ShapeBatch, index: int) -> d
     shown = {"photograph": photograph}
     for name, each, color in (("mesh", mesh, _BLUE), ("truth", truth, _GREY)):
         there = bool(len(each.faces_packed()))
-        shown[name] = draw_meshes(paper, each, batch.intrinsics[index], [color])
+        shown[name] = draw_meshes(paper, each, lens, [color])
         shown[f"{name}, {_OTHER_SIDE}"] = phong_view(each, view, color, _PICTURE_PX) if there else paper
     return shown
 
 
 def _headline(number: int, row: Row, classes: Sequence[str]) -> str:
     name = classes[row["label"]] if row["label"] < len(classes) else f"class {row['label']}"
-    scores = ", ".join(f"{key.removeprefix('model_')} {value:.3g}" for key, value in row.items() if "model_" in key)
+    scores = ", ".join(f"{key[6:]} {value:.3g}" for key, value in row.items() if key.startswith("model_"))
     return f"{number}: {name} {row['shape']}; {scores}"
 
 
