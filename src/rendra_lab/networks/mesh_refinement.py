@@ -88,17 +88,36 @@ class RefinementStage(nn.Module):
     def _seen(self, meshes: Meshes, maps: Sequence[Tensor], places: Tensor) -> Tensor:
         """The narrowed features of the maps at the vertices: (V, D).
 
-        Reading a map between its cells is linear, and so is narrowing: maps have fewer cells than meshes vertices,
-        so that they are narrowed first. The paper's head then takes a twentieth of the work.
+        Reading a map between its cells is linear, and so is narrowing: maps have fewer cells than meshes have
+        vertices, so that they are narrowed first. The paper's head then takes a twentieth of the work.
         """
         sizes = [each.shape[1] for each in maps]
         weights = self.bottleneck.weight.split(sizes, dim=1)
         narrow = [F.conv2d(each, w[:, :, None, None]) for each, w in zip(maps, weights, strict=True)]
-        read = vert_align(
-            narrow, places, padding_mode=self.padding_mode, align_corners=self.align_corners
-        )  # (N, P, L D)
+        narrow = _put_together(narrow) if self.align_corners else narrow
+        read = vert_align(narrow, places, padding_mode=self.padding_mode, align_corners=self.align_corners)
         packed = read.flatten(0, 1).index_select(0, meshes.verts_padded_to_packed_idx())
-        return packed.unflatten(1, (len(maps), -1)).sum(1) + self.bottleneck.bias
+        return packed.unflatten(1, (len(narrow), -1)).sum(1) + self.bottleneck.bias
+
+
+def _put_together(maps: Sequence[Tensor]) -> list[Tensor]:
+    """Fewer maps of the same sum: those whose cells are cells of the finest map too are added to it.
+
+    With their outermost cells in one place, what lies between the cells of a coarse map is a bilinear function that
+    the finest map holds exactly.
+    """
+    finest = max(maps, key=lambda each: each.shape[2] * each.shape[3])
+    size = finest.shape[2:]
+    total, others = finest, []
+    for each in maps:
+        if each is finest:
+            continue
+        pairs = zip(each.shape[2:], size, strict=True)
+        if finest.numel() and all(few > 1 and (many - 1) % (few - 1) == 0 for few, many in pairs):
+            total = total + F.interpolate(each, size, mode="bilinear", align_corners=True)
+        else:
+            others.append(each)
+    return [total, *others]
 
 
 class MeshRefinement(nn.Module):
