@@ -48,23 +48,26 @@ class Sizing:
         return height, width
 
 
-def read_colors(path: Path, where: str, expected: Size, shown: Size) -> Float[Tensor, "3 H W"]:
-    """Colours, sRGB in [0, 1]; each pixel is a mean of all that it covers. What is transparent lies over white.
+def read_colors(
+    path: Path, where: str, expected: Size, shown: Size, background: str | None = "white"
+) -> Float[Tensor, "3 H W"]:
+    """Colours, sRGB in [0, 1]; each pixel is a mean of all that it covers.
 
     Args:
         path: of the picture.
         where: who names it, for complaints.
         expected: size of the file.
         shown: H and W of the result.
+        background: a colour's name, behind what is transparent; None drops alpha.
 
     Raises:
         UserError: no picture that can be read, or one of another size.
     """
     demand_size(path, where, image_size(path, where), expected)
     picture = decode(path, where)
-    if "A" in picture.getbands() or "transparency" in picture.info:
+    if background is not None and ("A" in picture.getbands() or "transparency" in picture.info):
         picture = picture.convert("RGBA")
-        picture = Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture)
+        picture = Image.alpha_composite(Image.new("RGBA", picture.size, background), picture)
     pixels = np.array(_resized(picture.convert("RGB"), shown))
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float() / 255
 
