@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from far_device import Far, far  # noqa: F401
 from lightning.pytorch import LightningModule, Trainer
 from torch.utils.data import DataLoader
 
@@ -162,3 +163,15 @@ def test_thresholds_are_those_of_the_protocol() -> None:
         mesh_term("f1", 0.25)
     with pytest.raises(UserError, match=r"chamfer has no threshold, got 0\.1"):
         mesh_term("chamfer", 0.1)
+
+
+def test_scores_stay_on_the_device_of_the_meshes(far: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    generator = torch.Generator()  # the device that stands in has none of its own
+    monkeypatch.setattr(torch, "Generator", lambda device: generator)
+    predicted, truth = (
+        Meshes([m.verts_packed().to(far)], [m.faces_packed().to(far)]) for m in (square(0.02), square())
+    )
+    scores = score_surfaces(predicted, truth, samples=60)
+    assert isinstance(scores.f1, Far)
+    empty = Meshes([torch.zeros(0, 3).to(far)], [torch.zeros(0, 3, dtype=torch.int64).to(far)])
+    assert isinstance(score_surfaces(empty, truth, samples=60).chamfer, Far)

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 import torch
+from far_device import Far, far  # noqa: F401
 
 from rendra.structures import Meshes, join_meshes_as_batch
 from rendra.utils import ico_sphere
 from rendra_lab.detection.average_precision import AveragePrecision, MeshAgreement, average_precision, photo_precision
+from rendra_lab.detection.coco_evaluation import CocoPrecision
 from rendra_lab.detection.object_frames import depth_extents
 from rendra_lab.detection.overlaps import nearest_truths
 from rendra_lab.detection.records import Detections, Instances
@@ -175,3 +177,21 @@ def test_the_nearest_truth_of_each_found_object() -> None:
     )
     assert rows.tolist() == [1, -1, 2]
     assert overlaps.tolist() == pytest.approx([100 / 110, 0, 1])
+
+
+def test_detections_of_any_device_are_judged(far: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    generator = torch.Generator()  # the device that stands in has none of its own
+    monkeypatch.setattr(torch, "Generator", lambda device: generator)
+    found, true = ball_scene()
+    square = torch.ones(2, 8, 8)
+    found, true = replace(found, masks=square).to(far), true.to(far)
+    for kind in ("box", "mask", "mesh"):
+        metric = AveragePrecision(kind, samples=60)
+        metric.update(found, true, LENS.to(far))
+        assert isinstance(metric.scores[0], Far)
+        assert isinstance(metric.hits[0], Far)
+        assert 0 <= float(metric.compute()) <= 100
+    coco = CocoPrecision("mask")
+    coco.update(found, true)
+    assert isinstance(coco.ignored[0], Far)
+    assert float(coco.compute()) == pytest.approx(100)
