@@ -18,6 +18,7 @@ from rendra_lab.data.announced import announced
 from rendra_lab.data.epochs import Samples
 from rendra_lab.data.kept_tensors import Tensors, kept_or_made
 from rendra_lab.data.photo_data import PhotoData, PhotoSplits, joined_shapes
+from rendra_lab.data.pix3d_writer import checked_folder, keys_of, write_pix3d
 from rendra_lab.detection.records import Instances, PhotoBatch
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Positive, check_numbers
@@ -104,6 +105,27 @@ class FurnitureRooms(PhotoData):
         parts = {part: list(itertools.islice(photos, self.counts[part])) for part in SPLITS}
         train, val, test = (RoomPhotos(parts[part], self.shelf, part) for part in SPLITS)
         return PhotoSplits(train, val, test)
+
+    def write(self, folder: str | Path, overwrite: bool = False) -> Path:
+        """All pictures as a folder of Pix3D's layout, see `pix3d_writer`; it appears when it is complete.
+
+        Returns:
+            The folder.
+
+        Raises:
+            UserError: a folder that is not empty, or holds something else.
+        """
+        folder = checked_folder(folder, overwrite)  # before minutes of work
+        self.setup("fit")
+        parts = {part: self._photos_of(part) for part in SPLITS}
+        keys = {key for photos in parts.values() for photo in photos for key in keys_of(photo)}
+        shapes = {key: self.shelf.shape(*key) for key in sorted(keys)}
+        return write_pix3d(parts, shapes, self.split, folder, overwrite)
+
+    def _photos_of(self, part: str) -> Sequence[RoomPhoto]:
+        photos = getattr(self.splits, part)
+        assert isinstance(photos, RoomPhotos)
+        return photos.photos
 
     def numbers(self, part: str) -> range:
         """Which models of each name stand in the rooms of train, val or test."""
