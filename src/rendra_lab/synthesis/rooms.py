@@ -19,6 +19,7 @@ from torch import Tensor
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Range, check_numbers
 from rendra_lab.synthesis.baked_light import Blockers, Lights, bake, openness
+from rendra_lab.synthesis.lit_solids import lit_surfaces
 from rendra_lab.synthesis.posed_views import PosedViews
 from rendra_lab.synthesis.rooms_furnishing import Furnishing, Lamp, furnish
 from rendra_lab.synthesis.rooms_shell import (
@@ -31,7 +32,7 @@ from rendra_lab.synthesis.rooms_shell import (
     floor_and_ceiling,
     wall_frame,
 )
-from rendra_lab.synthesis.rooms_surfaces import SURFACES, TILE_M, linear_color, paint_surfaces
+from rendra_lab.synthesis.rooms_surfaces import paint_surfaces
 from rendra_lab.synthesis.solids import Floats, Solid
 from rendra_lab.synthesis.surface_pictures import LitSurfaces, picture_views
 from rendra_lab.synthesis.texture_pyramid import TexturePyramid
@@ -205,32 +206,10 @@ def _lit(
 ) -> LitSurfaces:
     """The triangles of a room and the light that reaches their corners."""
     solids = [*shell, *things]
-    points, normals, uvs = (
-        np.concatenate([getattr(solid, name) for solid in solids]) for name in ("points", "normals", "uvs")
-    )
-    counts = np.array([len(solid.points) for solid in solids])
-    offsets = np.cumsum(counts) - counts
-    faces = torch.from_numpy(
-        np.concatenate([solid.faces + first for solid, first in zip(solids, offsets, strict=True)])
-    )
-    glow = np.repeat(np.array([solid.glow for solid in solids], np.float32), counts)
-    num_shell = int(counts[: len(shell)].sum())
-    light = torch.from_numpy(_baked(points, normals, glow, num_shell, extent, lights, blockers, rng))
-    per_face = np.repeat(np.arange(len(solids)), [len(solid.faces) for solid in solids])
-    which = np.array([SURFACES.index(solid.surface) for solid in solids])[per_face]
-    tiles = torch.from_numpy(np.array([TILE_M[name] for name in SURFACES], np.float32)[which])
-    tint = torch.stack([linear_color(solid.color) for solid in solids])[torch.from_numpy(per_face)]
-    verts = torch.from_numpy(points)
-    places = torch.from_numpy(uvs)[faces] / tiles[:, None, None]
-    return LitSurfaces(
-        verts=verts,
-        faces=faces,
-        places=places,
-        light=light[faces],
-        which=torch.from_numpy(which),
-        tint=tint,
-        scale=_sides_a_metre(verts[faces], places),
-    )
+    points, normals = (np.concatenate([getattr(solid, name) for solid in solids]) for name in ("points", "normals"))
+    glow = np.repeat(np.array([solid.glow for solid in solids], np.float32), [len(solid.points) for solid in solids])
+    num_shell = sum(len(solid.points) for solid in shell)
+    return lit_surfaces(solids, _baked(points, normals, glow, num_shell, extent, lights, blockers, rng))
 
 
 def _baked(
@@ -252,14 +231,6 @@ def _baked(
     whole = direct + around[:, None] * bounced
     whole *= np.float32(rng.uniform(0.55, 0.85)) / whole[:num_shell].mean()
     return np.where(glow[:, None] > 0, glow[:, None], whole)
-
-
-def _sides_a_metre(corners: Tensor, places: Tensor) -> Tensor:
-    """How many sides of their picture faces span a metre (F,), from their areas."""
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = torch.linalg.cross(one, other).norm(dim=1)
-    u, v = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
-    return ((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs() / area.clamp_min(1e-9)).sqrt().clamp(1e-3, 1e3)
 
 
 def has_clearance(room: Room, places: Floats, margin: float = CLEARANCE_M) -> npt.NDArray[np.bool_]:

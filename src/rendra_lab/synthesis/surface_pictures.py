@@ -103,12 +103,13 @@ def shade(
         0, 1
     )
     face, z = fragments.pix_to_face.flatten(), fragments.zbuf.flatten()
-    is_hit = face >= 0
-    face = face.clamp_min(0)
-    extent = _footprint(surfaces, intrinsics, pose, size, face, z.clamp_min(_NEAREST))
+    hit = (face >= 0).nonzero()[:, 0]
+    face, z, seen = face[hit], z[hit], seen.index_select(0, hit)
+    extent = _footprint(surfaces, intrinsics, pose, (hit // size[1], hit % size[1]), face, z.clamp_min(_NEAREST))
     albedo = pictures.look_up(surfaces.which[face], seen[:, :2], extent) * surfaces.tint.index_select(0, face)
-    radiance = albedo * seen[:, 2:] * is_hit[:, None]
-    return toned(radiance).view(*size, 3).movedim(-1, 0)
+    picture = albedo.new_zeros(size[0] * size[1], 3)
+    picture[hit] = toned(albedo * seen[:, 2:])
+    return picture.view(*size, 3).movedim(-1, 0)
 
 
 def faces_seen(
@@ -139,16 +140,14 @@ def to_bytes(picture: Float[Tensor, "3 H W"]) -> UInt8[Tensor, "3 H W"]:
 
 
 def _footprint(
-    surfaces: LitSurfaces, intrinsics: Tensor, pose: Tensor, size: tuple[int, int], face: Tensor, z: Tensor
+    surfaces: LitSurfaces, intrinsics: Tensor, pose: Tensor, pixels: tuple[Tensor, Tensor], face: Tensor, z: Tensor
 ) -> Tensor:
-    """Sides (N,) of the squares that samples cover on their pictures, in sides of the picture.
+    """Sides (N,) of the squares that samples at rows and columns cover on their pictures, in sides of the picture.
 
     A sample at distance t on a surface that the camera stands h above covers (z / f)^2 t / h.
     """
-    height, width = size
-    y = (torch.arange(height) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
-    x = (torch.arange(width) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
-    stretch = (1 + x.square()[None] + y.square()[:, None]).sqrt().flatten()  # distance by depth
+    y, x = ((pixels[axis] + 0.5 - intrinsics[1 - axis, 2]) / intrinsics[1 - axis, 1 - axis] for axis in (0, 1))
+    stretch = (1 + x.square() + y.square()).sqrt()  # distance by depth
     eye = -pose[:3, :3].mT @ pose[:3, 3]
     corners = surfaces.verts[surfaces.faces]
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
