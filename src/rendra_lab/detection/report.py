@@ -174,7 +174,9 @@ class _Scene:
         picture: (H, W, 3), without what was filled up.
         found: the surest first.
         truth: what is annotated.
-        meshes: of what is found, in the axes of the camera; None of detectors without.
+        colors: of what is found: those of the annotated objects that it is on.
+        num_meshes: that were rebuilt, one of each found object; 0 of detectors without.
+        meshes: those, in the axes of the camera.
     """
 
     def __init__(self, rgb: Tensor, found: Detections, truth: Instances, lens: Tensor) -> None:
@@ -182,6 +184,8 @@ class _Scene:
         self.found, self.truth, self.lens = found, truth, lens
         self.true_meshes = None if truth.shapes is None or not len(truth.labels) else true_meshes(truth.shapes)
         self.partners = nearest_truths(found, truth)[0].tolist()
+        others = len(truth.labels)
+        self.colors = [color_of(true if true >= 0 else others + i) for i, true in enumerate(self.partners)]
         self.num_meshes = 0 if found.meshes is None else len(found.meshes)
         if self.num_meshes:
             self.meshes = rebuilt_in_camera(found, lens[None].expand(1, 3, 3), self._depths())
@@ -200,20 +204,18 @@ class _Scene:
         true_masks = self.truth.masks.repeat_interleave(zoom, 1).repeat_interleave(zoom, 2)
         names = [class_name(classes, label) for label in self.truth.labels.tolist()]
         said = [self.caption(classes, i) for i in range(len(self.found.labels))]
-        # found objects have the colours of the annotated ones that they are on
-        colors = [color_of(true if true >= 0 else len(names) + i) for i, true in enumerate(self.partners)]
         shown = {
             "annotated": draw_objects(picture, zoom * self.truth.boxes, names, true_masks),
-            "found": draw_objects(picture, boxes, said, masks, colors),
+            "found": draw_objects(picture, boxes, said, masks, self.colors),
         }
         if self.num_meshes:
             zoomed = self.lens * self.lens.new_tensor([[zoom], [zoom], [1]])
-            shown["rebuilt"] = draw_meshes(picture, self.meshes, zoomed, colors)
+            shown["rebuilt"] = draw_meshes(picture, self.meshes, zoomed, self.colors)
         return shown
 
     def mesh_pictures(self, index: int) -> dict[str, Picture]:
         """One mesh beside its part of the picture, from two sides, and the truth from the same ones."""
-        color = color_of(index)
+        color = self.colors[index]
         shown = {"photograph": _crop(self.picture, self.found.boxes[index])}
         shown |= {f"mesh {side}": phong_view(self.meshes[index], SIDES[side], color, _SIDE_PX) for side in _TWO_SIDES}
         if self.true_meshes is not None and self.partners[index] >= 0:
