@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rendra_lab.synthesis.furniture import NAMES, Finish, Furniture, draw
+from rendra_lab.synthesis.furniture import NAMES, Finish, Furniture, draw, draw_finish
 
-_COLLECTION = 7  # the stream of random numbers that shapes are drawn from
+_COLLECTION, _MATERIALS = 7, 8  # streams of random numbers: a shape may not depend on what else is drawn
 
 
 class FurnitureModels:
@@ -27,7 +27,7 @@ class FurnitureModels:
         self.seed = seed
 
     def model(self, name: str, number: int, finish: Finish | None = None) -> Furniture:
-        """One of them, of some materials; None draws these with the shape.
+        """One of them, of some materials; None: of any, which are always the same.
 
         Raises:
             ValueError: a name or a number that is not in the collection.
@@ -36,8 +36,10 @@ class FurnitureModels:
             raise ValueError(
                 f"the collection has {self.per_name} models each of: {', '.join(NAMES)}; got {name!r} {number}"
             )
-        rng = np.random.default_rng([_COLLECTION, self.seed, NAMES.index(name), number])
-        return replace(draw(name, rng, finish), model=model_id(name, number))
+        key = [self.seed, NAMES.index(name), number]
+        materials = draw_finish(np.random.default_rng([_MATERIALS, *key])) if finish is None else finish
+        piece = draw(name, np.random.default_rng([_COLLECTION, *key]), materials)
+        return replace(piece, model=model_id(name, number))
 
     def stock(self, numbers: range) -> ModelStock:
         """Some of the models of each name, for rooms."""
