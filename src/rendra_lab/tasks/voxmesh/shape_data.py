@@ -12,10 +12,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from rendra_lab.data.epochs import Samples, ShuffledEpochs
+from rendra_lab.data.photo_data import joined_shapes
 from rendra_lab.data.shares import Share, ShareSampler
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Positive, check_numbers
-from rendra_lab.shape_records import ShapeBatch, Shapes
+from rendra_lab.shape_records import ShapeBatch
 
 
 @dataclass(frozen=True)
@@ -133,15 +134,6 @@ def joined(batches: Sequence[ShapeBatch]) -> ShapeBatch:
         intrinsics=column("intrinsics"),
         depth_range=column("depth_range"),
         labels=column("labels"),
-        shapes=_joined_shapes([batch.shapes for batch in batches]),
+        shapes=joined_shapes([batch.shapes for batch in batches]),
         shape_ids=[name for batch in batches for name in batch.shape_ids],
-    )
-
-
-def _joined_shapes(parts: Sequence[Shapes]) -> Shapes:
-    tensors = ("points", "normals", "voxels", "voxels_to_camera")
-    return Shapes(
-        **{name: torch.cat([getattr(shapes, name) for shapes in parts]) for name in tensors},
-        verts=tuple(verts for shapes in parts for verts in shapes.verts),
-        faces=tuple(faces for shapes in parts for faces in shapes.faces),
     )
