@@ -4,6 +4,7 @@ from assertions import assert_close
 from far_device import Far, far  # noqa: F401
 
 from rendra.ops.graph_conv import GraphConv, gather_scatter
+from rendra.structures import join_meshes_as_batch
 from rendra.utils import ico_sphere, torus
 
 PATH = torch.tensor([[0, 1], [1, 2], [3, 1]])
@@ -95,6 +96,13 @@ def test_threads_do_not_show() -> None:
     for sums, gradient in results[1:]:
         assert torch.equal(sums, results[0][0])
         assert torch.equal(gradient, results[0][1])
+
+
+def test_the_matrix_of_a_mesh_stands_for_its_edges() -> None:
+    mesh = join_meshes_as_batch([ico_sphere(0), ico_sphere(1)])
+    rows, conv = torch.rand(len(mesh.verts_packed()), 3), GraphConv(3, 2)
+    expected = conv(rows, mesh.edges_packed())
+    torch.testing.assert_close(conv.over(rows, mesh.topology.neighbours(torch.float32)), expected)
 
 
 def test_wrong_shapes_are_named() -> None:

@@ -15,15 +15,19 @@ from torch.nn import functional as F
 
 from rendra.structures import Meshes
 from rendra_lab.base_task import Task
+from rendra_lab.detection.drawing import draw_meshes, upright
 from rendra_lab.detection.records import CellVerdicts, MeshVerdicts
 from rendra_lab.frustums import Frustums
+from rendra_lab.mesh_scores import true_meshes
 from rendra_lab.networks.mesh_refinement import MeshRefinement
 from rendra_lab.settings import Positive
 from rendra_lab.shape_records import ShapeBatch
 from rendra_lab.tasks.voxmesh.records import ShapePrediction
 from rendra_lab.tasks.voxmesh.starts import MeshStart, Start
+from rendra_lab.visualization import to_picture
 
 _FARTHEST = 2.0  # of positions that graph convolutions are told, in half widths of the picture
+_SHOWN = 4  # pictures of a batch in its panels
 
 
 class VoxMesh(Task[ShapeBatch, ShapePrediction]):
@@ -66,13 +70,18 @@ class VoxMesh(Task[ShapeBatch, ShapePrediction]):
         )
 
     def panels(self, prediction: ShapePrediction, batch: ShapeBatch) -> dict[str, Tensor]:
-        """The pictures, and the meshes as the cameras see them."""
-        return {"input": batch.rgb.movedim(1, -1)}
+        """The first pictures, and what their cameras would see of the meshes and of the truth."""
+        shown = batch.rgb[:_SHOWN].movedim(1, -1)
+        pages = {"input": shown, "start": _drawn(prediction.starts, batch, shown)}
+        if prediction.starts is not prediction.meshes:
+            pages["mesh"] = _drawn(prediction.meshes, batch, shown)
+        return {**pages, "truth": _drawn(true_meshes(batch.shapes), batch, shown)}
 
     def meshes(self, prediction: ShapePrediction, batch: ShapeBatch) -> dict[str, Meshes]:
-        """The first mesh, and the truth, in the camera's axes."""
-        truth = Meshes([batch.shapes.verts[0]], [batch.shapes.faces[0]])
-        return {"mesh": prediction.meshes[0], "start": prediction.starts[0], "truth": truth}
+        """The first mesh, what it began with, and the truth: x right, y up, z towards the camera."""
+        truth = true_meshes(batch.shapes)
+        named = {"mesh": prediction.meshes, "start": prediction.starts, "truth": truth}
+        return {name: upright(each[0]) for name, each in named.items()}
 
     def _resized(self, pictures: Tensor) -> Tensor:
         shorter = min(pictures.shape[-2:])
@@ -105,3 +114,10 @@ def whole_frustums(batch: ShapeBatch) -> Frustums:
     height, width = batch.rgb.shape[-2:]
     box = batch.intrinsics.new_tensor([0.0, 0.0, width, height])
     return Frustums(box.expand(len(batch.rgb), 4), batch.depth_range, batch.intrinsics)
+
+
+def _drawn(meshes: Meshes, batch: ShapeBatch, pages: Tensor) -> Tensor:
+    """One mesh of each, on white: as large as the pages (P, H, W, 3)."""
+    paper = to_picture(torch.ones_like(pages[0]))
+    drawn = [draw_meshes(paper, meshes[i], batch.intrinsics[i]) for i in range(len(pages))]
+    return torch.stack([torch.from_numpy(each).to(pages) / 255 for each in drawn])
