@@ -7,7 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
+
 from rendra_lab.base_task import Task
+from rendra_lab.detection.drawing import panels_of
 from rendra_lab.detection.records import DetectorPrediction, PhotoBatch
 from rendra_lab.detection.two_stage_detector import TwoStageDetector
 
@@ -27,3 +30,7 @@ class MaskRCNN(Task[PhotoBatch, DetectorPrediction]):
     def predict(self, batch: PhotoBatch) -> DetectorPrediction:
         """In training mode verdicts for the losses, in evaluation mode detections."""
         return self.detector(batch)
+
+    def panels(self, prediction: DetectorPrediction, batch: PhotoBatch) -> dict[str, Tensor]:
+        """What was found with a score of at least 0.5, and what is annotated."""
+        return {} if prediction.detections is None else panels_of(batch, prediction.detections)
