@@ -38,6 +38,8 @@ SIDES = {
 _GOLDEN = 0.618034  # hues that are this far apart never come close to each other
 _TINT = 0.45  # of a mask over its picture
 _MATTE = Materials(specular_color=((0.15, 0.15, 0.15),))
+_ASIDE_PX = 0.0137  # middles of pixels that lie on edges of voxels would belong to neither of their sides
+_SEAM = 1e-10  # squared, in half sides of the picture: far below a pixel
 _SHARP_SIGMA = 1e-6  # a silhouette with edges of about a pixel
 
 
@@ -164,11 +166,14 @@ def _seen(scene: Meshes, intrinsics: Tensor, size: Sequence[int]) -> tuple[Tenso
     height, width = (fine * side for side in size)
     lens = intrinsics.to(scene.verts_packed()).clone()
     lens[:2] *= fine
+    lens[:2, 2] += _ASIDE_PX
     cameras = cameras_from_opencv_projection(
         torch.eye(3)[None].to(lens), torch.zeros(1, 3).to(lens), lens[None],
         torch.tensor([[height, width]], device=lens.device),
     )  # fmt: skip
-    rasterizer = MeshRasterizer(cameras, RasterizationSettings(image_size=(height, width), cull_to_frustum=False))
+    # without any blur the middle of a pixel that lies on an edge belongs to neither of its faces
+    settings = RasterizationSettings(image_size=(height, width), blur_radius=_SEAM, cull_to_frustum=False)
+    rasterizer = MeshRasterizer(cameras, settings)
     fragments = rasterizer(scene)
     lights = Headlight().lights(cast(Any, cameras))
     shaded = HardPhongShader(cameras=cameras, lights=lights, materials=_MATTE.to(scene.device))(fragments, scene)

@@ -33,7 +33,7 @@ class ShapeHeads(nn.Module):
         depth_pool, voxel_pool, mesh_pool: cut the regions of the heads; voxels have twice the cells of theirs.
         depth: tells depth extents.
         voxels: tells voxels, of any class.
-        meshes: refines meshes.
+        meshes: refines meshes; None: the surface of the voxels is the answer ("voxel-only").
         threshold: probability above which a voxel is filled.
         points: of each true surface that a step learns from.
         most_regions: of a step that learn, drawn at random; None: all that hold objects.
@@ -46,7 +46,7 @@ class ShapeHeads(nn.Module):
         voxel_pool: RoiAlign,
         voxels: VoxelHead,
         mesh_pool: RoiAlign,
-        meshes: MeshRefinement,
+        meshes: MeshRefinement | None,
         threshold: Fraction = 0.2,
         points: Positive = 5000,
         most_regions: Positive | None = None,
@@ -70,21 +70,21 @@ class ShapeHeads(nn.Module):
         regions = self._drawn(regions)
         truth = self._truth(regions, batch)
         logits = self._voxels(maps, regions.boxes, regions.picture)
-        return {
-            "depths": DepthVerdicts(
-                self._depths(maps, regions.boxes, regions.picture, regions.labels), truth.log_extents
-            ),
+        depths = self._depths(maps, regions.boxes, regions.picture, regions.labels)
+        said = {
+            "depths": DepthVerdicts(depths, truth.log_extents),
             "voxels": CellVerdicts(logits, truth.voxels.to(logits)),
-            "meshes": self._learn_meshes(maps, regions, logits, truth),
         }
+        return said if self.meshes is None else said | {"meshes": self._learn_meshes(maps, regions, logits, truth)}
 
     def describe(self, maps: Maps, found: Detections) -> Detections:
         """See `RegionHead`: depth extents, voxels and meshes, which begin as a cube where no voxel is filled."""
         logits = self._voxels(maps, found.boxes, found.picture)
         meshes = Meshes([], []).to(found.boxes.device)
         if len(found.boxes):
-            first, _ = cubified(logits, self.threshold)
-            meshes = self.meshes(first, [self.mesh_pool(maps, found.boxes, found.picture)])[-1]
+            meshes, _ = cubified(logits, self.threshold)
+            if self.meshes is not None:
+                meshes = self.meshes(meshes, [self.mesh_pool(maps, found.boxes, found.picture)])[-1]
         extents = extents_of(self._depths(maps, found.boxes, found.picture, found.labels))
         return replace(found, depth_extents=extents, voxels=torch.sigmoid(logits), meshes=meshes)
 

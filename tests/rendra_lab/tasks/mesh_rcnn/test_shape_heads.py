@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rendra.utils import ico_sphere
 from rendra_lab import shape_losses
-from rendra_lab.detection.object_frames import depth_extents, depth_ranges
+from rendra_lab.detection.object_frames import depth_extents, depth_ranges, rebuilt_in_camera
 from rendra_lab.detection.records import DepthVerdicts, Detections, Instances, MeshVerdicts, PhotoBatch
 from rendra_lab.detection.regions import ObjectRegions
 from rendra_lab.detection.roi_align import RoiAlign
@@ -180,6 +180,42 @@ def test_found_objects_are_rebuilt_even_where_no_voxel_is() -> None:
     torch.testing.assert_close(rebuilt.meshes.verts_packed().abs().amax(), torch.tensor(0.5))
     assert none.meshes is not None
     assert len(none.meshes) == 0
+
+
+def test_voxels_alone_are_a_mesh_too() -> None:
+    made, features = heads(), maps()
+    made.meshes = None
+    said = made.learn(features, regions(2), photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES))
+    assert set(said) == {"depths", "voxels"}
+    zeros = torch.zeros(2, dtype=torch.long)
+    found = made.describe(features, Detections(zeros, BOXES, zeros, torch.ones(2)))
+    assert found.meshes is not None
+    assert found.meshes.num_verts_per_mesh().tolist() == [9**3 - 7**3] * 2  # an untrained head fills every voxel
+
+
+def test_what_heads_learn_is_where_the_object_is() -> None:
+    """Depth extent, voxels and mesh of a ball, learned and taken back to its camera."""
+    made, features = heads(), maps()
+    shapes = balls((0.0, 0.0, 2.0))
+    box = torch.tensor([[19.5, 11.5, 44.5, 36.5]])  # as wide as the ball is seen
+    zero = torch.zeros(1, dtype=torch.long)
+    batch = photos(shapes, box)
+    optimizer = torch.optim.Adam(made.parameters(), 0.01)
+    for _ in range(50):
+        said = made.learn(features, ObjectRegions(zero, box, zero + 1, zero), batch)
+        cells = shape_losses.voxel_cross_entropy(said["voxels"])
+        loss = depth_extent(said["depths"]) + 3 * cells + stage_losses(said["meshes"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():
+        found = made.describe(features, Detections(zero, box, zero + 1, torch.ones(1)))
+    rebuilt = rebuilt_in_camera(found, LENS, torch.tensor([2.0])).verts_packed()
+    radii = (rebuilt - torch.tensor([0.0, 0.0, 2.0])).norm(dim=1)
+    assert found.depth_extents is not None
+    assert found.depth_extents.item() == pytest.approx(0.8 / 2 * 60 / 25, rel=0.02)
+    assert radii.mean().item() == pytest.approx(0.4, rel=0.08)
+    assert radii.std().item() < 0.055  # of a cube: 0.08
 
 
 def test_the_depth_loss_is_a_mean() -> None:
