@@ -17,19 +17,29 @@ from rendra_lab import report, visualization
 from rendra_lab.base_task import BaseTask
 from rendra_lab.callbacks import writers
 from rendra_lab.data.meshes import bounding_sphere
-from rendra_lab.detection.drawing import SIDES, Color, draw_meshes, phong_view, upright
+from rendra_lab.detection.drawing import Color, draw_meshes, phong_view, upright
 from rendra_lab.mesh_scores import ProtocolName, true_meshes
+from rendra_lab.pictures import OrbitCamera
 from rendra_lab.settings import Count, Positive
 from rendra_lab.shape_records import ShapeBatch
 from rendra_lab.tasks.voxmesh.baselines import MeanShapes
 from rendra_lab.tasks.voxmesh.records import ShapePrediction
-from rendra_lab.tasks.voxmesh.shape_table import Row, class_means_of, means_of, numbers_of, results
+from rendra_lab.tasks.voxmesh.shape_table import (
+    LOGGED,
+    TITLES,
+    Row,
+    class_means_of,
+    means_of,
+    numbers_of,
+    results,
+)
 from rendra_lab.visualization import Picture
 
 _PICTURE_PX = 192
 _BLUE: Color = (0.25, 0.5, 0.85)
 _GREY: Color = (0.72, 0.72, 0.72)
 _OTHER_SIDE = "from behind"
+_BEHIND = OrbitCamera(elev=50, azim=130, fov=30)  # cameras look down a little: less high would be from below
 
 
 class ShapeReport(Callback):
@@ -102,13 +112,13 @@ class ShapeReport(Callback):
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Logs what the others come to, and the mean over classes."""
-        for name, value in means_of(self._rows).items():
-            if not name.startswith("model_"):
-                pl_module.log(f"test/{name.replace('.', '_')}", value, rank_zero_only=True)
-        for name, value in class_means_of(self._rows).items():
-            if name.startswith("model_"):
-                short = name.removeprefix("model_").replace(".", "_")
-                pl_module.log(f"test/class_mean_{short}", value, rank_zero_only=True)
+        means, class_means = means_of(self._rows), class_means_of(self._rows)
+        for method in TITLES:
+            for name in LOGGED[self.protocol]:
+                if method != "model" and f"{method}_{name}" in means:
+                    pl_module.log(f"test/{method}_{name}", means[f"{method}_{name}"], rank_zero_only=True)
+        for name in LOGGED[self.protocol] if self._rows else ():
+            pl_module.log(f"test/class_mean_{name}", class_means[f"model_{name}"], rank_zero_only=True)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the files and prints the tables."""
@@ -162,9 +172,8 @@ def pictures_of(mesh: Meshes, truth: Meshes, batch: ShapeBatch, index: int) -> d
     paper = np.full_like(visualization.resize(photograph, zoom * len(photograph)), 255)
     lens = batch.intrinsics[index] * batch.intrinsics.new_tensor([[zoom], [zoom], [1]])
     center, radius = bounding_sphere(upright(truth))
-    view = SIDES[_OTHER_SIDE]
     # both are seen from one place: as far as the truth fits with a little around it
-    view = replace(view, at=tuple(center.tolist()), dist=1.25 * radius / sin(radians(view.fov) / 2))
+    view = replace(_BEHIND, at=tuple(center.tolist()), dist=1.25 * radius / sin(radians(_BEHIND.fov) / 2))
     shown = {"photograph": photograph}
     for name, each, color in (("mesh", mesh, _BLUE), ("truth", truth, _GREY)):
         there = bool(len(each.faces_packed()))

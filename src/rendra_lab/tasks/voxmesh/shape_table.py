@@ -29,6 +29,12 @@ _SHOWN: dict[ProtocolName, dict[str, str]] = {
     "scaled": {"f1_10": "F1@0.1", "f1_30": "F1@0.3", "f1_50": "F1@0.5"},
     "p2m": {"f1_1": "F1@1e-4", "f1_1.4142": "F1@2e-4"},  # squared distances, as its tables have them
 }
+LOGGED: dict[ProtocolName, tuple[str, ...]] = {
+    "scaled": ("chamfer", "normal", "f1_30"),
+    "p2m": ("chamfer", "normal", "f1_1"),
+}
+"""The numbers of each method that curves and summaries of runs show."""
+
 _DISTANCES: dict[ProtocolName, str] = {
     "scaled": "Distances after the longest side of the true box is 10",
     "p2m": "Distances times 0.57; thresholds are squares",
