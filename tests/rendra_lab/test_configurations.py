@@ -37,11 +37,26 @@ _FEW_PAIRS = (
     "data.cache=null",
     "callbacks.pairs.pictures=1",
 )
+_FEW_ROOMS = ("data.counts=[2,1,1]", "data.batch_size=2", "data.cache=null", "callbacks.detections.pictures=1")
+_FEW_SHAPES = (
+    "data.counts=[2,1,1]",
+    "data.views=1",
+    "data.eval_views=1",
+    "data.image_size=33",
+    "data.batch_size=2",
+    "data.cache=null",
+    "data.voxels=16",
+    "callbacks.shapes.pictures=1",
+    "callbacks.shapes.samples=500",
+)
 _OF_TASKS = {
+    "mask_rcnn": _FEW_ROOMS,
+    "mesh_rcnn": _FEW_ROOMS,
     "nerf": _SMALL_SCENE,
     "volume": (*_SMALL_SCENE, *_OF_VOLUMES["grid"]),
     "smplify": _FEW_PEOPLE,
     "synsin": _FEW_PAIRS,
+    "voxmesh": _FEW_SHAPES,
 }
 _OF_FIELDS = {
     "hash_grid": ("field.encoding.log2_table_size=8", "field.width=8"),
@@ -55,6 +70,7 @@ _OF_SAMPLERS = {
     "stratified": ("sampler.samples=6",),
 }
 SMALLER = {
+    "mesh_rcnn_voxel_only": _FEW_ROOMS,
     "synsin_paper": (*_FEW_PAIRS, "network.depth.levels=6", "renderer.points_per_pixel=8"),
     "volume_book": (*_SMALL_SCENE, *_OF_VOLUMES["book"]),
     "nerf_book": (*_TINY, "sampler.samples=4"),
@@ -158,7 +174,7 @@ def test_every_experiment_makes_a_step_and_says_how(
     lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[0] == "# @package _global_"
     assert f"python train.py experiment={experiment}" in lines[1]
-    few = {"smplify": _FEW_PEOPLE, "synsin": _FEW_PAIRS}.get(experiment.partition("_")[0], ())
+    few = {"smplify": _FEW_PEOPLE, "synsin": _FEW_PAIRS, "voxmesh": _FEW_SHAPES}.get(experiment.partition("_")[0], ())
     settings = (f"experiment={experiment}", *SMALLER.get(experiment, few))
     assert one_step(compose, tmp_path / "experiment" / "run", *settings)["steps"] >= 1
 

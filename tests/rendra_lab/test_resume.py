@@ -50,6 +50,11 @@ SMALLER = {
     "pose": _SMALL_MESH,
     "smplify": ("data.count=4", "data.image_size=64", "data.cache=null", "module.narrow=[[3,2]]"),
     "synsin": ("data.image_size=64", "data.counts=[2,1,1]", "data.batch_size=4", "data.cache=null"),
+    "voxmesh": (
+        *("data.image_size=33", "data.counts=[2,1,1]", "data.views=2", "data.eval_views=1", "data.voxels=16"),
+        *("data.batch_size=2", "data.cache=null", "head.start.warmup_steps=2", "callbacks.shapes.samples=500"),
+        *("network.side_px=33", "network.voxel_head.side=8"),
+    ),
     "toy": ("+data.steps=5", "trainer.val_check_interval=1.0"),
 }
 VARIANTS = {
