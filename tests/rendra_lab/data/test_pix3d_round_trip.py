@@ -35,6 +35,7 @@ def pairs(one: PhotoData, other: PhotoData) -> Iterator[tuple[PhotoBatch, PhotoB
 
 def test_pix3d_reads_what_was_generated(rooms: tuple[FurnitureRooms, Path]) -> None:
     made, folder = rooms
+    assert Pix3D.classes == made.classes
     for ours, read in pairs(made, Pix3D(folder, points=20, voxels=12, flip=False, **WHOLE)):
         assert torch.equal(ours.rgb, read.rgb)
         assert torch.equal(ours.intrinsics, read.intrinsics)
