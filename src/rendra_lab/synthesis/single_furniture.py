@@ -29,14 +29,14 @@ from rendra_lab.synthesis.solids import Floats, Solid, weld
 from rendra_lab.synthesis.surface_pictures import LitSurfaces, shade, to_bytes
 from rendra_lab.synthesis.texture_pyramid import TexturePyramid
 
-EDITION = 1  # of the pictures and shapes; another one makes all cached ones anew
+EDITION = 2  # of the pictures and shapes; another one makes all cached ones anew
 FOCAL = 2.1875  # in halves of the picture's height: 35 mm before a sensor of 32 mm, as in R2N2's Blender
 DEPTH_RANGE = (0.603009, 2.441406)  # where Blender's depths are 0.67 and 0.92, nearest 0.1 and farthest 100
 
 _DISTANCE = (1.3, 1.75)  # as R2N2's, but for those so near that pieces leave the picture
 _ELEVATION_DEG = (25.0, 30.0)
 # degrees that the camera is turned away from the front at most: from behind these are boxes like any other
-_TURN_DEG = {"bookcase": 100.0, "wardrobe": 100.0, "cupboard": 100.0, "nightstand": 100.0, "desk": 130.0}
+_TURN_DEG = {"bookcase": 70.0, "wardrobe": 70.0, "cupboard": 70.0, "nightstand": 70.0, "desk": 110.0}
 _SIDE = 2  # samples of a pixel along each of its sides
 _PALETTES = 4  # sets of painted materials
 _LIT_M = 2.0  # diagonal of pieces while they are lit: shadows are as sharp in all of them
