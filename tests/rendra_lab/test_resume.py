@@ -44,6 +44,7 @@ SMALLER = {
         "module.refine_at=[2,5]",
         "module.samples=200",
     ),
+    "mask_rcnn": ("data.counts=[4,1,1]", "data.batch_size=2", "callbacks.detections.pictures=0"),
     "nerf": (*_SCENE, *_OCCUPANCY, *_HASHES),
     "volume": (*_SCENE, *_VOLUME),
     "pose_track": ("data.frames=4", "data.steps_per_frame=3", *_SMALL_MESH),

@@ -72,7 +72,9 @@ class MaskHead(nn.Module):
         if not len(boxes):  # group norm takes no empty batch; the gradients of all weights are zeros
             return self._nothing(maps)
         x = F.relu(self.wider(self.convs(self.pool(maps, boxes, picture))))
-        weight, bias = self.logits.weight[labels, :, 0, 0], self.logits.get_parameter("bias")[labels]
+        # index_select: plain indexing adds up its gradient in parallel, in whatever order the threads come
+        weight = self.logits.weight.flatten(1).index_select(0, labels)
+        bias = self.logits.get_parameter("bias").index_select(0, labels)
         return torch.baddbmm(bias[:, None, None], weight[:, None], x.flatten(2)).view(-1, self.side, self.side)
 
     def learn(self, maps: Maps, regions: ObjectRegions, batch: PhotoBatch) -> Mapping[str, CellVerdicts]:
