@@ -7,11 +7,14 @@ from typing import Any
 import pytest
 import torch
 from box_pictures import SIDE, box_pictures
+from far_device import Far, far  # noqa: F401
+from torch import nn
 
 from rendra_lab.networks.mesh_refinement import MeshRefinement
 from rendra_lab.networks.residual_backbone import ResidualBackbone
 from rendra_lab.networks.voxel_head import VoxelHead
 from rendra_lab.shape_losses import stage_chamfer, stage_edges, stage_normals, voxel_cross_entropy
+from rendra_lab.tasks.voxmesh.baselines import MeanShapes
 from rendra_lab.tasks.voxmesh.starts import SphereStart, VoxelStart
 from rendra_lab.tasks.voxmesh.task import VoxMesh, whole_frustums
 from rendra_lab.terms import LossTerm
@@ -155,3 +158,19 @@ def test_an_evaluation_leaves_no_trace() -> None:
     first, second = model.observe(batch), model.observe(batch)
     assert model.training
     assert torch.equal(first.meshes.verts_packed(), second.meshes.verts_packed())
+
+
+@pytest.mark.parametrize("start", [None, SphereStart(1)])
+def test_a_step_stays_where_its_batch_lies(far, start: Any) -> None:  # noqa: F811
+    model, batch = task(start, names=("chamfer", "normals", "edges")), box_pictures(SIZES[:2])
+    for module in model.modules():
+        for name, buffer in module._buffers.items():
+            module._buffers[name] = buffer.to(far)
+        for name, parameter in module._parameters.items():
+            if parameter is not None:
+                module._parameters[name] = nn.Parameter(parameter.detach().to(far))
+    prediction = model.predict(batch.to(far))
+    model.objective(prediction, batch)[0].backward()
+    assert isinstance(prediction.meshes.verts_packed(), Far)
+    assert isinstance(model.backbone.conv1.weight.grad, Far)
+    assert isinstance(MeanShapes([batch.to(far)]).posed(batch.to(far)).verts_packed(), Far)
