@@ -31,7 +31,7 @@ from rendra_lab.synthesis.texture_pyramid import TexturePyramid
 
 EDITION = 2  # of the pictures and shapes; another one makes all cached ones anew
 FOCAL = 2.1875  # in halves of the picture's height: 35 mm before a sensor of 32 mm, as in R2N2's Blender
-DEPTH_RANGE = (0.603009, 2.441406)  # where Blender's depths are 0.67 and 0.92, nearest 0.1 and farthest 100
+DEPTH_RANGE = (0.8, 2.25)  # of pieces whose boxes have a diagonal of 1, at the distances below
 
 _DISTANCE = (1.3, 1.75)  # as R2N2's, but for those so near that pieces leave the picture
 _ELEVATION_DEG = (25.0, 30.0)
