@@ -39,7 +39,7 @@ def test_the_published_sizes() -> None:
 
 def test_the_small_ones_have_every_part_and_fit_together() -> None:
     parts = networks("small")
-    assert sum(sizes(parts[name]) for name in ("encoder", "depth", "decoder")) == 602_845
+    assert sum(sizes(parts[name]) for name in ("encoder", "depth", "decoder")) == 1_603_693
     assert sizes(parts["discriminator"]) == 85_538
     pictures = torch.rand(2, 3, 64, 64)
     features, depth = parts["encoder"](pictures), parts["depth"](pictures)
@@ -151,4 +151,4 @@ def test_network_takes_the_word_of_the_task(size: str, tmp_path: Path) -> None:
         search = f"hydra.searchpath=[file://{tmp_path}]"
         cfg = compose("train", overrides=[search, "task=synsin", f"network={size}"])
     assert sorted(cfg.network) == ["decoder", "depth", "discriminator", "encoder"]
-    assert cfg.network.depth.base == {"paper": 32, "small": 8}[size]
+    assert cfg.network.depth.base == {"paper": 32, "small": 16}[size]
