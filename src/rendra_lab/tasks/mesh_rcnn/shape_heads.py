@@ -54,7 +54,8 @@ class ShapeHeads(nn.Module):
         super().__init__()
         self.depth_pool, self.depth = depth_pool, depth
         self.voxel_pool, self.voxels = voxel_pool, voxels
-        self.mesh_pool, self.meshes = mesh_pool, meshes
+        self.mesh_pool = mesh_pool
+        self.meshes: MeshRefinement | None = meshes
         self.threshold = threshold
         self.points = points
         self.most_regions = most_regions
@@ -71,11 +72,13 @@ class ShapeHeads(nn.Module):
         truth = self._truth(regions, batch)
         logits = self._voxels(maps, regions.boxes, regions.picture)
         depths = self._depths(maps, regions.boxes, regions.picture, regions.labels)
-        said = {
+        said: dict[str, DepthVerdicts | CellVerdicts | MeshVerdicts] = {
             "depths": DepthVerdicts(depths, truth.log_extents),
             "voxels": CellVerdicts(logits, truth.voxels.to(logits)),
         }
-        return said if self.meshes is None else said | {"meshes": self._learn_meshes(maps, regions, logits, truth)}
+        if self.meshes is not None:
+            said["meshes"] = self._learn_meshes(self.meshes, maps, regions, logits, truth)
+        return said
 
     def describe(self, maps: Maps, found: Detections) -> Detections:
         """See `RegionHead`: depth extents, voxels and meshes, which begin as a cube where no voxel is filled."""
@@ -109,12 +112,14 @@ class ShapeHeads(nn.Module):
     def _voxels(self, maps: Maps, boxes: Tensor, picture: Tensor) -> Tensor:
         return self.voxels(self.voxel_pool(maps, boxes, picture))
 
-    def _learn_meshes(self, maps: Maps, regions: ObjectRegions, logits: Tensor, truth: ShapeTargets) -> MeshVerdicts:
+    def _learn_meshes(
+        self, refine: MeshRefinement, maps: Maps, regions: ObjectRegions, logits: Tensor, truth: ShapeTargets
+    ) -> MeshVerdicts:
         if not len(regions.boxes):  # something to refine all the same: the gradient of every weight is to be there
             cells = maps[0].new_zeros(1, maps[0].shape[1], self.mesh_pool.side, self.mesh_pool.side)
             nothing = maps[0].new_zeros(1, 1, 3)
             is_valid = torch.zeros(1, dtype=torch.bool, device=cells.device)
-            return MeshVerdicts(self.meshes(central_tetrahedra(1, cells), [cells]), nothing, nothing, is_valid)
+            return MeshVerdicts(refine(central_tetrahedra(1, cells), [cells]), nothing, nothing, is_valid)
         first, is_found = cubified(logits, self.threshold)
-        stages = self.meshes(first, [self.mesh_pool(maps, regions.boxes, regions.picture)])
+        stages = refine(first, [self.mesh_pool(maps, regions.boxes, regions.picture)])
         return MeshVerdicts(stages, truth.points, truth.normals, is_found & truth.is_near)

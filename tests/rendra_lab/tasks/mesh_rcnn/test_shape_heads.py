@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
+from far_device import Far, far  # noqa: F401
 from torch import Tensor
 
 from rendra.utils import ico_sphere
@@ -216,6 +218,22 @@ def test_what_heads_learn_is_where_the_object_is() -> None:
     assert found.depth_extents.item() == pytest.approx(0.8 / 2 * 60 / 25, rel=0.02)
     assert radii.mean().item() == pytest.approx(0.4, rel=0.08)
     assert radii.std().item() < 0.055  # of a cube: 0.08
+
+
+def test_heads_stay_on_the_device_of_their_maps(far: Any) -> None:  # noqa: F811
+    made, features = heads(), [each.to(far) for each in maps()]
+    for module in made.modules():
+        for name, weight in module._parameters.items():
+            if weight is not None:
+                module._parameters[name] = torch.nn.Parameter(weight.detach().to(far))
+    batch = photos(balls((0.0, 0.0, 2.0), (-0.5, -0.3, 3.0)), BOXES).to(far)
+    for count in (0, 2):
+        said = made.learn(features, regions(count).to(far), batch)
+        assert all(isinstance(each, Far) for each in (said["depths"].targets, said["voxels"].targets))
+        assert isinstance(stage_losses(said["meshes"]), Far)
+        zeros = torch.zeros(count, dtype=torch.long)
+        found = made.describe(features, Detections(zeros, BOXES[:count], zeros, torch.ones(count)).to(far))
+        assert isinstance(rebuilt_in_camera(found, LENS.to(far), torch.ones(count).to(far)).verts_packed(), Far)
 
 
 def test_the_depth_loss_is_a_mean() -> None:
