@@ -1,9 +1,9 @@
 """Depth that explains a second picture: what a pixel shows is where its depth says, in the other view.
 
-SynSin learns depth through splats alone, whose gradients reach as far as a disc: tens of thousands of steps. Seen from
-pixels, as in Zhou et al., "Unsupervised Learning of Depth and Ego-Motion from Video", CVPR 2017, and Godard et al.,
-"Digging Into Self-Supervised Monocular Depth Estimation", ICCV 2019 (Eqs. 2 and 3), and from coarse pictures to fine
-ones, whose gradients reach across objects, a thousand will do. It needs pairs alone.
+SynSin learns depth through splats alone, whose gradients reach as far as a disc: tens of thousands of steps. Seen
+from pixels, as in Zhou et al., "Unsupervised Learning of Depth and Ego-Motion from Video", CVPR 2017, and Godard et
+al., "Digging Into Self-Supervised Monocular Depth Estimation", ICCV 2019 (Eqs. 2 and 3), and from coarse pictures to
+fine ones, whose gradients reach across objects, a thousand will do. It needs pairs alone.
 """
 
 from __future__ import annotations
