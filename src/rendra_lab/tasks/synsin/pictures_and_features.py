@@ -17,7 +17,7 @@ from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.synsin.hole_filling import filled
 
 _LEAST_COVER = 1e-3  # of a pixel: where there is less, the colour is nobody's
-_TRUST = 2.0  # how much an untrained decoder keeps of the colours that it is given, before a sigmoid
+_TRUST = 4.0  # how much an untrained decoder keeps of covered pixels' colours, before a sigmoid; half of holes'
 
 
 class FeatureEncoder(nn.Module):
@@ -99,8 +99,9 @@ class RefinementDecoder(nn.Module):
             raise ValueError(f"a decoder of {self.channels} features got {tuple(features.shape)}")
         if not self.keep_color:
             return 0.5 * torch.tanh(self.chain(features)) + 0.5
-        cover = features[:, 3:4]
-        given = filled((features[:, :3] / cover.clamp_min(_LEAST_COVER)).clamp(-1, 1), cover.clamp(0, 1))
+        weights = features[:, 3:4]
+        cover = weights.clamp(0, 1)
+        given = filled((features[:, :3] / weights.clamp_min(_LEAST_COVER)).clamp(-1, 1), cover)
         answer = self.chain(torch.cat([given, features[:, 3:]], 1))
-        picture = torch.lerp(torch.tanh(answer[:, :3]), given, torch.sigmoid(answer[:, 3:] + _TRUST))
+        picture = torch.lerp(torch.tanh(answer[:, :3]), given, torch.sigmoid(answer[:, 3:] + _TRUST * cover))
         return 0.5 * picture + 0.5
