@@ -177,7 +177,7 @@ def test_bad_settings_are_named():
         check_targets({"_target_": "rendra_lab.tasks.synsin.splatting.PointSplatter", "accumulation": "sum"})
 
 
-@pytest.mark.parametrize(("name", "radius"), [("splat", 4.0), ("splat_small", 2.0)])
+@pytest.mark.parametrize(("name", "radius"), [("splat", 4.0), ("splat_small", 1.5)])
 @pytest.mark.parametrize("accumulation", ACCUMULATIONS)
 def test_configurations_make_splatters(name, radius, accumulation):
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
