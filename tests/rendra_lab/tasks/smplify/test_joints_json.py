@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 from small_files import image_bytes
 
-from rendra_lab.data import json_fields
 from rendra_lab.errors import UserError
 from rendra_lab.tasks.smplify.joint_layouts import LAYOUTS
 from rendra_lab.tasks.smplify.joints_json import JointsJSON
@@ -286,7 +285,7 @@ def test_a_picture_in_two_files_is_refused(tmp_path: Path) -> None:
         people(tmp_path)
 
 
-def test_huge_broken_and_missing_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_huge_broken_and_missing_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "j.json"
     for content, message in (
         (b"{", "is no JSON"),
@@ -296,8 +295,10 @@ def test_huge_broken_and_missing_files_are_refused(tmp_path: Path, monkeypatch: 
         path.write_bytes(content)
         with pytest.raises(UserError, match=message):
             people(path)
-    monkeypatch.setattr(json_fields, "_MOST_BYTES", 10)
-    assert "bytes; at most 10 are read" in refused(path, pictures("lsp14", rows("lsp14")))
+    with path.open("wb") as file:
+        file.truncate((64 << 20) + 1)
+    with pytest.raises(UserError, match="bytes; at most 67,108,864 are read"):
+        people(path)
     with pytest.raises(UserError, match="there is no file or folder"):
         people(tmp_path / "away.json")
     (tmp_path / "empty").mkdir()
