@@ -2,115 +2,47 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import torch
-from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils.data import DataLoader, Dataset
 
-from rendra_lab.data.epochs import Samples, ShuffledEpochs
-from rendra_lab.data.shares import Share, ShareSampler
+from rendra_lab.data.epochs import Samples
+from rendra_lab.data.sample_data import SampleData, SampleSplits
 from rendra_lab.detection.records import Instances, PhotoBatch
-from rendra_lab.errors import UserError
-from rendra_lab.settings import Count, Positive, check_numbers
+from rendra_lab.settings import Positive
 from rendra_lab.shape_records import Shapes
 
-
-@dataclass(frozen=True)
-class PhotoSplits:
-    """Pictures by their numbers, each a batch of one, in three parts."""
-
-    train: Samples[PhotoBatch]
-    val: Samples[PhotoBatch]
-    test: Samples[PhotoBatch]
+PhotoSplits = SampleSplits[PhotoBatch]
 
 
-class PhotoData(LightningDataModule, ABC):
+class PhotoData(SampleData[PhotoBatch]):
     """Annotated pictures; subclasses say where they come from.
-
-    Several processes divide training batches and validation pictures among them; each of them sees the whole test.
 
     Args:
         batch_size: pictures of a training step, of all processes together.
-        eval_batch_size: pictures of a batch in validation and test; None: as in training.
-        num_workers: processes that load training pictures ahead.
         flip: show every other training picture in a mirror, with all that belongs to it.
-        seed: of the order of training pictures and of what they draw.
-
-    Raises:
-        UserError: an impossible number.
+        **loading: settings of `SampleData`.
     """
 
-    is_divisible = True
+    what = "pictures"
     classes: tuple[str, ...]  # by label: subclasses know them once they are set up
-    splits: PhotoSplits
 
-    def __init__(
-        self,
-        batch_size: Positive = 4,
-        eval_batch_size: Positive | None = None,
-        num_workers: Count = 0,
-        flip: bool = True,
-        seed: Count = 0,
-    ) -> None:
-        super().__init__()
-        check_numbers("data", Positive, batch_size=batch_size)
-        check_numbers("data", Positive | None, eval_batch_size=eval_batch_size)
-        check_numbers("data", Count, num_workers=num_workers, seed=seed)
-        self.batch_size = batch_size
-        self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
-        self.num_workers = num_workers
+    def __init__(self, batch_size: Positive = 4, flip: bool = True, **loading: Any) -> None:
+        super().__init__(batch_size, **loading)
         self.flip = flip
-        self.seed = seed
 
-    @abstractmethod
-    def load(self) -> PhotoSplits:
-        """All pictures; UserError says what is wrong with where they come from."""
+    def for_training(self, samples: Samples[PhotoBatch]) -> Samples[PhotoBatch]:
+        """Every other one in a mirror, where that is asked for."""
+        return Mirrored(samples) if self.flip else samples
 
-    def setup(self, stage: str) -> None:
-        """Lightning's hook, before the fit and again before the test: loads the pictures, once."""
-        if not hasattr(self, "splits"):
-            self.splits = self.load()
-
-    def train_dataloader(self) -> ShuffledEpochs[PhotoBatch]:
-        """Shuffled training pictures."""
-        photos = self.splits.train
-        if len(photos) < self.batch_size:
-            raise UserError(
-                f"data.batch_size={self.batch_size} is more than the {len(photos)} training pictures that there are"
-            )
-        return ShuffledEpochs(
-            Mirrored(photos) if self.flip else photos,
-            self.batch_size,
-            seed=self.seed,
-            collate=joined,
-            drop_last=True,
-            num_workers=self.num_workers,
-        )
-
-    def val_dataloader(self) -> Sequence[PhotoBatch] | DataLoader[PhotoBatch]:
-        """Validation pictures in their order, a share of them in each process."""
-        photos = self.splits.val
-        return self._in_order(photos, Share.of(self).whole_if_few(len(photos)))
-
-    def test_dataloader(self) -> Sequence[PhotoBatch] | DataLoader[PhotoBatch]:
-        """All test pictures in their order."""
-        return self._in_order(self.splits.test, Share())
-
-    def _in_order(self, photos: Samples[PhotoBatch], share: Share) -> Sequence[PhotoBatch] | DataLoader[PhotoBatch]:
-        if len(photos) == 0:
-            return []
-        return DataLoader(
-            _AsDataset(photos),
-            self.eval_batch_size,
-            sampler=ShareSampler(len(photos), share),
-            collate_fn=joined,
-            generator=torch.Generator(),  # loaders draw a seed for workers: not from the fit's stream
-        )
+    @staticmethod
+    def joined(batches: Sequence[PhotoBatch]) -> PhotoBatch:
+        """See `joined`."""
+        return joined(batches)
 
 
 class Mirrored:
@@ -125,14 +57,6 @@ class Mirrored:
     def __getitem__(self, index: int) -> PhotoBatch:
         photo = self.photos[index]
         return mirrored(photo) if torch.rand(()) < 0.5 else photo
-
-
-class _AsDataset(Dataset[PhotoBatch]):
-    def __init__(self, photos: Samples[PhotoBatch]) -> None:
-        self.photos = photos
-
-    def __getitem__(self, index: int) -> PhotoBatch:
-        return self.photos[index]
 
 
 def mirrored(photo: PhotoBatch) -> PhotoBatch:

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from rendra_lab.data.announced import announced
 from rendra_lab.data.kept_tensors import Tensors, kept_or_made
 from rendra_lab.errors import UserError
-from rendra_lab.settings import Count, Positive, Range, check_numbers
+from rendra_lab.settings import Count, Range, check_numbers
 from rendra_lab.synthesis.posed_views import PosedViews, World, seen_by
 from rendra_lab.tasks.synsin.pair_data import PairData, PairSplits
 from rendra_lab.tasks.synsin.records import PairBatch, PairTruth
@@ -39,7 +39,7 @@ class GeneratedPairs(PairData):
             have two views, which are one pair.
         cache: folder of rendered views; null renders them every time.
         scenes_seed: of the places.
-        batch_size, eval_batch_size, num_workers, truth_in_training, seed: see `PairData`.
+        **loading: settings of `PairData`.
 
     Raises:
         UserError: an impossible setting.
@@ -53,13 +53,9 @@ class GeneratedPairs(PairData):
         views_per_scene: _Views = 3,
         cache: str | Path | None = None,
         scenes_seed: Count = 0,
-        batch_size: Positive = 8,
-        eval_batch_size: Positive | None = None,
-        num_workers: Count = 0,
-        truth_in_training: bool = False,
-        seed: Count = 0,
+        **loading: Any,
     ) -> None:
-        super().__init__(batch_size, eval_batch_size, num_workers, truth_in_training, seed)
+        super().__init__(**loading)
         size = [image_size] * 2 if isinstance(image_size, int) else list(image_size)
         if len(size) != 2 or not all(isinstance(side, int) and 8 <= side <= 4096 for side in size):
             raise UserError(
