@@ -1,0 +1,1 @@
+"""GIRAFFE: scenes made of objects, learned from unposed pictures."""
