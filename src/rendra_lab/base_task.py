@@ -222,9 +222,16 @@ class Task(BaseTask[BatchT, PredictionT]):
 
 
 def weighted_sum(losses: nn.ModuleDict, prediction: Any, batch: Any, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-    """An objective of named `LossTerm`s at a step, a scalar, and every term without its weight."""
-    terms = {name: _named(name, term, prediction, batch) for name, term in losses.items()}
-    weights = {name: cast(LossTerm, term).weight_at(step) for name, term in losses.items()}
+    """An objective of named `LossTerm`s at a step, a scalar, and every term that is due, without its weight.
+
+    Raises:
+        ValueError: no term is due.
+    """
+    due = {name: term for name, term in cast(Iterable[tuple[str, LossTerm]], losses.items()) if term.is_due(step)}
+    if not due:
+        raise ValueError(f"no loss is due at step {step}: {', '.join(losses)}; one of them needs every=1")
+    terms = {name: _named(name, term, prediction, batch) for name, term in due.items()}
+    weights = {name: term.weight_at(step) for name, term in due.items()}
     return torch.as_tensor(sum(weights[name] * value for name, value in terms.items())), terms
 
 

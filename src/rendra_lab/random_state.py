@@ -104,6 +104,12 @@ def seeded(*key: int) -> Iterator[None]:
         torch.set_rng_state(states[2])
 
 
+def stream(*key: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A stream of its own on a device, which follows from whole numbers of at least 0 alone."""
+    (first,) = np.random.SeedSequence(key).generate_state(1, np.uint64).tolist()
+    return torch.Generator(device).manual_seed(first >> 1)
+
+
 class RandomState(Callback):
     """Keeps the random state in checkpoints, and the data position where the last finished step left it.
 

@@ -44,6 +44,7 @@ _ALLOWED_FUNCTIONS = (
     "rendra_lab.perceptual",
     "rendra_lab.schedulers",
     "rendra_lab.shape_losses",
+    "rendra_lab.tasks.giraffe.gan_losses",
     "rendra_lab.tasks.mesh_rcnn.losses",
     "rendra_lab.tasks.smplify.pose_prior",
     "rendra_lab.tasks.smplify.scores",

@@ -11,6 +11,7 @@ from torch.func import jvp, vmap
 from torchmetrics import Metric
 
 from rendra_lab.records import read_field
+from rendra_lab.settings import Positive
 
 Weight = float | Sequence[Sequence[float]]
 
@@ -49,7 +50,7 @@ class _Term(nn.Module):
     def __init__(
         self,
         fn: Callable[..., Any],
-        prediction: str,
+        prediction: str | None,
         target: str | None,
         context: Mapping[str, str] | None,
     ) -> None:
@@ -62,7 +63,7 @@ class _Term(nn.Module):
         self.context = dict(context or {})
 
     def _arguments(self, prediction: Any, batch: Any) -> tuple[list[Any], dict[str, Any]]:
-        positional = [read_field(prediction, self.prediction, "prediction")]
+        positional = [] if self.prediction is None else [read_field(prediction, self.prediction, "prediction")]
         if self.target is not None:
             positional.append(read_field(batch, self.target, "batch"))
         return positional, {key: read_field(batch, name, "batch") for key, name in self.context.items()}
@@ -76,21 +77,26 @@ class LossTerm(_Term):
             keyword. A least-squares term has a method `residuals` of the same arguments besides, with
             `fn(...) == fn.residuals(...).square().sum()`.
         weight: a number, or a schedule as a list of [step, weight] pairs (`PiecewiseLinear`).
-        prediction: the field of the prediction.
+        prediction: the field of the prediction, or null where the function takes the target alone.
         target: the field of the batch, or null where the function takes the prediction alone (a regulariser).
         context: further keyword arguments of `fn`, each with the batch field that it takes, such as
             `{mask: mask}`.
+        every: a costly term is counted once in so many steps, and then so many times as much.
     """
 
     def __init__(
         self,
         fn: Callable[..., Any],
         weight: Weight = 1.0,
-        prediction: str = "rgb",
+        prediction: str | None = "rgb",
         target: str | None = "rgb",
         context: Mapping[str, str] | None = None,
+        every: Positive = 1,
     ) -> None:
         super().__init__(fn, prediction, target, context)
+        if every < 1:
+            raise ValueError(f"a term is counted every so many steps, at least 1, got every={every}")
+        self.every = every
         self.weight = float(weight) if isinstance(weight, (int, float)) else PiecewiseLinear(weight)
 
     def forward(self, prediction: Any, batch: Any) -> Tensor:
@@ -98,9 +104,19 @@ class LossTerm(_Term):
         positional, keyword = self._arguments(prediction, batch)
         return self.fn(*positional, **keyword)
 
+    def is_due(self, step: int) -> bool:
+        """Whether it is counted at an optimisation step."""
+        return step % self.every == 0
+
     def weight_at(self, step: int) -> float:
         """The weight at an optimisation step."""
-        return self.weight if isinstance(self.weight, float) else self.weight(step)
+        if not self.is_due(step):
+            return 0.0
+        return self.every * (self.weight if isinstance(self.weight, float) else self.weight(step))
+
+    def reads(self, field: str) -> bool:
+        """Whether it takes a field of the batch."""
+        return field == self.target or field in self.context.values()
 
     def residuals(self, prediction: Any, batch: Any, step: int = 0) -> Tensor:
         """The vector (R,) whose squared length is the weighted term; TypeError if `fn` has none."""
