@@ -37,6 +37,8 @@ _ALLOWED_FUNCTIONS = (
     "rendra_lab.detection.average_precision",
     "rendra_lab.detection.coco_evaluation",
     "rendra_lab.detection.detector_losses",
+    "rendra_lab.generative.features",
+    "rendra_lab.generative.terms",
     "rendra_lab.losses",
     "rendra_lab.mesh_quality",
     "rendra_lab.mesh_scores",
