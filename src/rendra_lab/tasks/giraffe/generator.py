@@ -1,0 +1,214 @@
+"""Pictures of scenes that are made of objects.
+
+Niemeyer and Geiger, "GIRAFFE: Representing Scenes as Compositional Generative Neural Feature Fields", CVPR 2021.
+Letters: B pictures, N objects of a scene, P = V V rays of a picture, L pieces of rays, C features.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rendra_lab.errors import UserError
+from rendra_lab.settings import Amount
+from rendra_lab.tasks.giraffe.box_sampler import BoxSampler, rotation_about_z
+from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler, Rays
+from rendra_lab.tasks.giraffe.feature_fields import FeatureField, FieldValues, Stretches
+from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
+from rendra_lab.tasks.giraffe.ray_sampling import OwnRays, Pieces, Samples, Sampling, into_boxes
+from rendra_lab.tasks.giraffe.records import Codes, MadePictures, Scenes
+
+
+class CodeSizes(NamedTuple):
+    """How many numbers latent codes have, those of shape as those of appearance."""
+
+    object: int  # Z
+    background: int  # Zb
+
+
+class Generator(nn.Module):
+    """Objects and a background as feature fields, composed, looked at by few rays, and painted.
+
+    All objects share one field and differ by their codes; each field is evaluated in its own space.
+
+    Args:
+        object_field, background_field: with as many features each as the renderer takes.
+        renderer: paints.
+        sampling: where rays are looked at.
+        boxes: draws where objects are.
+        cameras: draws who looks, and casts rays.
+        density_noise: standard deviation of what is added to densities, before the ReLU and before boxes end, where
+            `forward` is given noise; published: 1.
+
+    Raises:
+        UserError: networks that do not fit each other.
+    """
+
+    def __init__(
+        self,
+        object_field: FeatureField,
+        background_field: FeatureField,
+        renderer: NeuralRenderer,
+        sampling: Sampling,
+        boxes: BoxSampler,
+        cameras: CameraSampler,
+        density_noise: Amount = 1.0,
+    ) -> None:
+        super().__init__()
+        made = object_field.features, background_field.features
+        if set(made) != {renderer.features}:
+            raise UserError(
+                f"the renderer takes {renderer.features} features, but the fields of objects and background make "
+                f"{made[0]} and {made[1]}"
+            )
+        self.object_field = object_field
+        self.background_field = background_field
+        self.renderer = renderer
+        self.sampling = sampling
+        self.boxes = boxes
+        self.cameras = cameras
+        self.density_noise = density_noise
+
+    @property
+    def picture_side(self) -> int:
+        """S."""
+        return self.renderer.picture_side
+
+    @property
+    def feature_side(self) -> int:
+        """V."""
+        return self.renderer.feature_side
+
+    @property
+    def objects(self) -> int:
+        """N."""
+        return self.boxes.objects
+
+    @property
+    def code_sizes(self) -> CodeSizes:
+        """Z and Zb."""
+        return CodeSizes(self.object_field.code, self.background_field.code)
+
+    def sample(self, count: int, generator: torch.Generator, temperature: float = 1.0) -> Scenes:
+        """B = `count` scenes as training sees them, on this network's device.
+
+        Args:
+            count: scenes.
+            generator: of all that is random; drawn from on its own device.
+            temperature: standard deviation of the codes; published pictures: 0.65.
+        """
+        like = self.object_field.out.weight
+        Z, Zb = self.code_sizes
+        shapes = (count, self.objects, Z), (count, self.objects, Z), (count, Zb), (count, Zb)
+        codes = [temperature * torch.randn(shape, generator=generator, device=generator.device) for shape in shapes]
+        boxes = self.boxes.sample(count, generator)
+        cameras = self.cameras.sample(count, generator)
+        boxes = replace(
+            boxes.to(like.device),
+            **{name: getattr(boxes, name).to(like) for name in ("scale", "translation", "rotation")},
+        )
+        return Scenes(Codes(*codes).to(like), boxes, cameras.to(like))
+
+    def forward(self, scenes: Scenes, noise: torch.Generator | None = None) -> MadePictures:
+        """Pictures, and the shares of things in them.
+
+        Args:
+            scenes: what to show.
+            noise: draws noise of densities and depths, as in training; None: neither.
+        """
+        features, shares = self._look(scenes, noise)
+        return MadePictures(self.renderer(features), shares)
+
+    def feature_image(self, scenes: Scenes) -> Float[Tensor, "B C V V"]:
+        """What the neural renderer is given."""
+        return self._look(scenes, None)[0]
+
+    def alpha_maps(self, scenes: Scenes) -> Float[Tensor, "B N+1 V V"]:
+        """Opacity of each object, and last of the background, as if it were alone in the world."""
+        rays, own = self._rays(scenes)
+        samples = self.sampling.samples(rays, own, scenes.boxes.exists, None)
+        objects = self._objects(scenes, own, samples.objects, None)
+        background = self._background(scenes, rays, samples.background, None)
+        alone = self.sampling.alone
+        return self._maps(
+            samples, alone(samples.objects, objects.density), alone(samples.background, background.density), scenes
+        )
+
+    def _look(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """The feature image and the shares of things in it."""
+        rays, own = self._rays(scenes)
+        samples = self.sampling.samples(rays, own, scenes.boxes.exists, noise)
+        objects = self._objects(scenes, own, samples.objects, noise)
+        background = self._background(scenes, rays, samples.background, noise)
+        of_objects, of_background = self.sampling.weights(samples, objects.density, background.density)
+        features, far_share = _summed(self.background_field, background, of_background)
+        near_features, near_share = _summed(self.object_field, objects, of_objects)
+        features = features.index_add(0, samples.objects.ray, near_features)
+        image = features.view(scenes.batch_size, self.feature_side, self.feature_side, -1).permute(0, 3, 1, 2)
+        return image.contiguous(), self._maps(samples, near_share, far_share, scenes)
+
+    def _rays(self, scenes: Scenes) -> tuple[Rays, OwnRays]:
+        self._check(scenes)
+        rays = self.cameras.rays(scenes.cameras, self.feature_side)
+        return rays, into_boxes(rays, scenes.boxes, self.sampling.padding)
+
+    def _objects(self, scenes: Scenes, own: OwnRays, at: Pieces, noise: torch.Generator | None) -> FieldValues:
+        """Densities that count, and hidden features, of objects."""
+        pixels = own.directions.shape[1]
+        directions = own.directions.flatten(0, 1).index_select(0, at.thing * pixels + at.ray % pixels)
+        origins = own.origins.index_select(0, at.thing)
+        codes = scenes.codes.shape.flatten(0, 1), scenes.codes.appearance.flatten(0, 1)
+        return self._evaluated(self.object_field, at, (origins, directions), codes, noise)
+
+    def _background(self, scenes: Scenes, rays: Rays, at: Pieces, noise: torch.Generator | None) -> FieldValues:
+        """The same of the background, which turns about z."""
+        turn = rotation_about_z(scenes.cameras.background_turn)
+        origins = (turn @ rays.origins[..., None]).squeeze(-1).index_select(0, at.thing)
+        directions = (rays.directions @ turn.mT).flatten(0, 1).index_select(0, at.ray)
+        codes = scenes.codes.background_shape, scenes.codes.background_appearance
+        return self._evaluated(self.background_field, at, (origins, directions), codes, noise)
+
+    def _evaluated(
+        self,
+        field: FeatureField,
+        at: Pieces,
+        rays: tuple[Tensor, Tensor],
+        codes: tuple[Tensor, Tensor],
+        noise: torch.Generator | None,
+    ) -> FieldValues:
+        origins, directions = rays
+        points = origins[:, None] + at.depths[..., None] * directions[:, None]
+        raw, hidden = field(Stretches(at.thing, points, F.normalize(directions, dim=-1)), *codes)
+        if noise is not None and self.density_noise > 0:
+            drawn = torch.randn(raw.shape, generator=noise, device=noise.device)
+            raw = raw + self.density_noise * drawn.to(raw)
+        return FieldValues(field.density_scale * F.relu(raw) * at.inside, hidden)
+
+    def _maps(self, samples: Samples, objects: Tensor, background: Tensor, scenes: Scenes) -> Tensor:
+        """Numbers of pieces (L,) and of rays (R,) as images (B, N + 1, V, V)."""
+        things, side = scenes.boxes.exists.numel(), self.feature_side
+        pixels = side * side
+        flat = samples.objects.thing * pixels + samples.objects.ray % pixels
+        of_objects = objects.new_zeros(things * pixels).index_add(0, flat, objects)
+        shape = scenes.batch_size, -1, side, side
+        return torch.cat([of_objects.view(shape), background.view(shape)], 1)
+
+    def _check(self, scenes: Scenes) -> None:
+        codes, (Z, Zb) = scenes.codes, self.code_sizes
+        if codes.shape.shape[2] != Z or codes.background_shape.shape[1] != Zb:
+            raise ValueError(
+                f"this generator takes codes of {Z} numbers for objects and {Zb} for the background, got "
+                f"{codes.shape.shape[2]} and {codes.background_shape.shape[1]}"
+            )
+
+
+def _summed(field: FeatureField, values: FieldValues, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Features (L, C) of pieces, their samples weighted, and the weights' sums (L,)."""
+    share = weights.sum(1)
+    hidden = torch.einsum("lkh,lk->lh", values.hidden, weights)
+    return field.to_features(hidden, share), share
