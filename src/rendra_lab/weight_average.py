@@ -27,8 +27,8 @@ def follow(average: nn.Module, network: nn.Module, decay: float) -> None:
     """Takes a step of the network into its average.
 
     Args:
-        average: of `average_of`, changed in place: every weight becomes decay * its own + (1 - decay) * the network's,
-            in the number format that it has; buffers, which are no weights, become the network's.
+        average: of `average_of`, changed in place: each weight becomes decay * its own + (1 - decay) * the network's;
+            buffers, which are no weights, become the network's.
         network: what has moved.
         decay: in [0, 1]; the average reaches about 1 / (1 - decay) steps back.
 

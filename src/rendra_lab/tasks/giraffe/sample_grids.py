@@ -1,0 +1,107 @@
+"""The same few scenes in the course of a training: what becomes of them, whose pixels are whose, and some turned.
+
+Shapes and letters: as of `records`.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from rendra_lab.random_state import stream
+from rendra_lab.records import TensorRecord
+from rendra_lab.settings import Amount, Count, Positive
+from rendra_lab.tasks.giraffe.edits import turned
+from rendra_lab.tasks.giraffe.generator import Generator
+from rendra_lab.tasks.giraffe.records import MadePictures, Scenes
+
+_BACKGROUND = (0.25, 0.25, 0.25)
+_AT_ONCE = 16  # pictures
+
+
+class SampleGrid:
+    """Draws scenes that stay the same from the first step to the last.
+
+    Args:
+        samples: scenes that are drawn.
+        turned: of these, how many are drawn with their first object turned.
+        headings: of each, evenly over the full turn, the drawn one first.
+        temperature: standard deviation of the latent codes: below 1, more usual things are drawn. Published: 0.65.
+        seed: of the scenes.
+    """
+
+    def __init__(
+        self,
+        samples: Positive = 16,
+        turned: Count = 4,
+        headings: Positive = 6,
+        temperature: Amount = 0.65,
+        seed: Count = 0,
+    ) -> None:
+        self.samples = samples
+        self.turned = min(turned, samples)
+        self.headings = headings
+        self.temperature = temperature
+        self.seed = seed
+
+    @torch.no_grad()
+    def drawn(self, generator: Generator) -> dict[str, Tensor]:
+        """What a generator makes of the scenes, as images (B, S, S, 3), sRGB in [0, 1].
+
+        Returns:
+            `samples`; `objects`, the share of each object in the pixels, in a colour of its own, and that of the
+            background in dark grey; and `turned`, a row a scene, where there are objects.
+        """
+        scenes = generator.sample(self.samples, stream(self.seed), self.temperature)
+        made = made_of(generator, scenes)
+        images = {"samples": made.rgb.movedim(1, -1), "objects": share_images(made.shares, made.rgb.shape[-1])}
+        if self.turned and generator.objects:
+            images["turned"] = self._turned(generator, scenes)
+        return images
+
+    def _turned(self, generator: Generator, scenes: Scenes) -> Tensor:
+        """Strips (turned, S, headings * S, 3)."""
+        few = chosen(scenes, torch.arange(self.turned, device=scenes.codes.shape.device))
+        angles = [2 * math.pi * number / self.headings for number in range(self.headings)]
+        views = [made_of(generator, turned(few, 0, angle)).rgb for angle in angles]
+        return torch.cat(views, dim=-1).movedim(1, -1)
+
+
+def made_of(generator: Generator, scenes: Scenes) -> MadePictures:
+    """The pictures of scenes without noise, a few at once so that little memory is needed."""
+    rows = torch.arange(scenes.batch_size, device=scenes.codes.shape.device).split(_AT_ONCE)
+    parts = [generator(chosen(scenes, few)) for few in rows]
+    return MadePictures(torch.cat([part.rgb for part in parts]), torch.cat([part.shares for part in parts]))
+
+
+def chosen(scenes: Scenes, rows: Tensor) -> Scenes:
+    """Some of the scenes, by their numbers."""
+
+    def picked(record: TensorRecord) -> dict[str, Tensor]:
+        return {name: getattr(record, name).index_select(0, rows) for name in record.names()}
+
+    return Scenes(
+        codes=replace(scenes.codes, **picked(scenes.codes)),
+        boxes=replace(scenes.boxes, **picked(scenes.boxes)),
+        cameras=replace(scenes.cameras, **picked(scenes.cameras)),
+    )
+
+
+def share_images(shares: Float[Tensor, "B N+1 V V"], side: int) -> Float[Tensor, "B S S 3"]:
+    """Shares in colours: each object has one of its own, the background is dark grey, what nobody has is black.
+
+    Args:
+        shares: of each object, and last of the background.
+        side: S, pixels.
+    """
+    objects = shares.shape[1] - 1
+    hues = [colorsys.hsv_to_rgb(number / max(objects, 1), 0.75, 1.0) for number in range(objects)]
+    colors = shares.new_tensor([*hues, _BACKGROUND])
+    images = torch.einsum("bnhw,nc->bchw", shares, colors)
+    return F.interpolate(images, (side, side)).movedim(1, -1).clamp(0, 1)
