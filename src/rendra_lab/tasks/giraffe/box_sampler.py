@@ -21,7 +21,8 @@ from rendra_lab.settings import Amount, Positive
 from rendra_lab.tasks.giraffe.records import Boxes
 
 _Corner = Sequence[float]
-_TRIES = 200  # draws of a box, or of all boxes of a scene, before they are said not to fit
+_TRIES = 200  # draws of scenes before their boxes are said not to fit
+_PLACES = 64  # drawn of a box, of which the first free one is taken
 _LAYOUT = "coordinates"
 
 
@@ -39,7 +40,7 @@ class BoxSampler:
         one_size: one number for the three sides, so that proportions are kept between the two ends.
         counts: how often a scene has 0, 1, .. N objects, in any unit; None: always N.
         plane: z of all middles, unless a layout says them; None: as drawn.
-        spacing: two boxes are at least so far apart along x, y or z; None lets them overlap.
+        spacing: two boxes are at least so far apart along x, y or z; None lets them overlap. Layouts are as measured.
         redraw: what is drawn again after a collision.
         turned_extents: boxes keep apart as they are turned.
         layouts: .npz file with `coordinates` (L, N, 3), middles of the boxes of L scenes; None draws them.
@@ -88,7 +89,7 @@ class BoxSampler:
         """
         exists = self._exists(count, generator)
         boxes = self._draw(exists, generator)
-        if self.spacing is None or self.objects == 1:
+        if self.spacing is None or self.objects == 1 or self.layouts is not None:
             return boxes
         return self._kept_apart(boxes, generator)
 
@@ -109,13 +110,19 @@ class BoxSampler:
 
     def collide(self, boxes: Boxes) -> Tensor:
         """Which two boxes that exist are nearer than `spacing` along each axis: bool (B, N, N), none with itself."""
-        extents = boxes.scale
-        if self.turned_extents:
-            extents = (boxes.rotation.mT.abs() @ extents[..., None]).squeeze(-1)
-        apart = (boxes.translation[:, :, None] - boxes.translation[:, None]).abs()
-        near = (apart < extents[:, :, None] + extents[:, None] + (self.spacing or 0.0)).all(-1)
+        near = self._near(boxes, boxes)
         both = boxes.exists[:, :, None] & boxes.exists[:, None]
         return near & both & ~torch.eye(boxes.exists.shape[1], dtype=torch.bool, device=near.device)
+
+    def _near(self, boxes: Boxes, others: Boxes) -> Tensor:
+        """Which of N and M boxes of each scene are too near: bool (B, N, M)."""
+        apart = (boxes.translation[:, :, None] - others.translation[:, None]).abs()
+        reach = self._extents(boxes)[:, :, None] + self._extents(others)[:, None] + (self.spacing or 0.0)
+        return (apart < reach).all(-1)
+
+    def _extents(self, boxes: Boxes) -> Tensor:
+        """Half of what boxes extend along x, y and z: (B, N, 3)."""
+        return (boxes.rotation.mT.abs() @ boxes.scale[..., None]).squeeze(-1) if self.turned_extents else boxes.scale
 
     def _draw(self, exists: Tensor, generator: torch.Generator) -> Boxes:
         shape = exists.shape
@@ -141,27 +148,31 @@ class BoxSampler:
 
     def _kept_apart(self, boxes: Boxes, generator: torch.Generator) -> Boxes:
         for _ in range(_TRIES):
-            if self.redraw == "object":
-                boxes = self._placed_in_turn(boxes, generator)
             clash = self.collide(boxes).flatten(1).any(1)
             if not bool(clash.any()):
                 return boxes
-            boxes = _replaced(boxes, self._draw(boxes.exists, generator), clash[:, None].expand_as(boxes.exists))
+            again = self._draw(boxes.exists, generator)
+            if self.redraw == "object":
+                again = self._placed_in_turn(again, generator)
+            boxes = _replaced(boxes, again, clash[:, None].expand_as(boxes.exists))
+        low, high = (end.tolist() for end in self.translation)
         raise UserError(
             f"{self.objects} boxes with half sides from {self.scale[0].tolist()} to {self.scale[1].tolist()} do not "
-            f"fit {self.spacing:g} apart into boxes.translation {[end.tolist() for end in self.translation]}: "
-            f"{int(clash.sum())} of {len(clash)} scenes still collide after {_TRIES} draws"
+            f"fit {self.spacing:g} apart into boxes.translation from {low} to {high}: {int(clash.sum())} of "
+            f"{len(clash)} scenes still collide after {_TRIES} draws"
         )
 
     def _placed_in_turn(self, boxes: Boxes, generator: torch.Generator) -> Boxes:
-        """Each box is drawn again until it is free of those before it, or too often."""
+        """Each box in the first of many drawn places that is free of those before it; perhaps of none."""
         for number in range(1, self.objects):
-            for _ in range(_TRIES):
-                clash = torch.zeros_like(boxes.exists)
-                clash[:, number] = self.collide(boxes)[:, number, :number].any(-1)
-                if not bool(clash.any()):
-                    break
-                boxes = _replaced(boxes, self._draw(boxes.exists, generator), clash)
+            many = torch.ones((len(boxes.exists), _PLACES), dtype=torch.bool, device=boxes.exists.device)
+            others = self._draw(many, generator)
+            taken = (self._near(others, boxes) & boxes.exists[:, None])[..., :number].any(-1)
+            first = taken.byte().argmin(1)  # the first 0
+            rows = torch.arange(len(first), device=first.device)
+            column = torch.arange(self.objects, device=first.device).expand_as(boxes.exists) == number
+            chosen = Boxes(*(getattr(others, name)[rows, first][:, None] for name in Boxes.names()))
+            boxes = _replaced(boxes, chosen, column)
         return boxes
 
     def _angles(self, parts: Tensor) -> Tensor:
