@@ -120,11 +120,12 @@ def sights(backdrop: Backdrop, eye: Float[Tensor, " 3"], rays: Float[Tensor, "R 
     on_ground = ~on_wall & to_ground.isfinite()
     far = torch.where(on_wall, to_wall, to_ground).clamp_max(1e4)
     place = eye + far[:, None] * rays
-    albedo = torch.where(
-        on_wall[:, None],
-        _albedo(backdrop.wall, torch.stack([u, height], 1), backdrop, 0),
-        _albedo(backdrop.ground, place[:, :2], backdrop, 1),
-    )
+    albedo = torch.zeros_like(rays)
+    for number, (surface, where, flat) in enumerate(
+        ((backdrop.wall, on_wall, torch.stack([u, height], 1)), (backdrop.ground, on_ground, place[:, :2]))
+    ):
+        rows = where.nonzero()[:, 0]
+        albedo[rows] = _albedo(surface, flat.index_select(0, rows), backdrop, number)
     left = torch.exp(-(far - eye.norm()).clamp_min(0) / backdrop.haze)[:, None]
     left = torch.where((on_wall | on_ground)[:, None], left, 0.0)
     facing = F.normalize(torch.lerp(normal, normal.new_tensor([0.0, 0.0, 1.0]), backdrop.seamless), dim=0)
@@ -253,9 +254,9 @@ def _place(ground: Surface, wall: Surface, distance: float, height: float, rng: 
 
 
 def _grass(rng: _RNG) -> Surface:
-    color = _hsv(rng, (0.19, 0.33), (0.35, 0.7), (0.3, 0.66))
+    color = _hsv(rng, (0.19, 0.33), (0.3, 0.62), (0.3, 0.66))
     length = float(rng.uniform(1.2, 3.5))
-    grain = float(rng.uniform(0.1, 0.3))
+    grain = float(rng.uniform(0.08, 0.25))
     return Surface(_two(color, rng, 0.3), 1.2, (length, length), grain, (0.6, 0.6))
 
 
@@ -333,7 +334,7 @@ def _barn(rng: _RNG) -> Surface:
 
 def _studio(rng: _RNG) -> Backdrop:
     """Before a sheet of paper that bends from the floor to the wall."""
-    color = _hsv(rng, (0.0, 1.0), (0.0, 0.5), (0.3, 0.95))
+    color = _hsv(rng, (0.0, 1.0), (0.0, 0.4), (0.3, 0.95))
     sheet = Surface(_two(color, rng, 0.08), 0.8, (6.0, 6.0), 0.0)
     place = _place(sheet, sheet, float(rng.uniform(0.7, 1.5)), 9.0, rng)
     return replace(place, turn=0.0, seamless=float(rng.uniform(0.75, 0.95)))
@@ -341,8 +342,8 @@ def _studio(rng: _RNG) -> Backdrop:
 
 def _cloth(rng: _RNG) -> Backdrop:
     """Before something painted in two colours and out of focus."""
-    one = _hsv(rng, (0.0, 1.0), (0.1, 0.6), (0.25, 0.9))
-    other = _hsv(rng, (0.0, 1.0), (0.1, 0.6), (0.25, 0.9))
+    one = _hsv(rng, (0.0, 1.0), (0.05, 0.45), (0.25, 0.9))
+    other = _hsv(rng, (0.0, 1.0), (0.05, 0.45), (0.25, 0.9))
     length = float(rng.uniform(2.0, 4.0))
     cloth = Surface(np.stack([one, (one + other) / 2]), 1.0, (length, length), 0.04, (1.0, 1.0))
     wall = replace(cloth, colors=np.stack([one, other]))

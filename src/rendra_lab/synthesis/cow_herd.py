@@ -22,7 +22,7 @@ from rendra_lab.synthesis.cow_coat import Coat, CoatParameters
 from rendra_lab.synthesis.signed_distance import Array
 
 EDITION = 1  # of the animals and their coats
-BUILDS = 16  # cows that differ in more than length, width and height
+BUILDS = 12  # cows that differ in more than length, width and height
 
 _PAINTS = ("base", "patch", "muzzle", "horn", "hoof")
 _STRETCH = 0.08  # of a cow along each of its axes
@@ -137,12 +137,12 @@ def painted(cow: Cow, coat: str, rng: _RNG) -> PaintedCow:
 def _paints(anatomy: Anatomy, points: Array) -> tuple[Tensor, Tensor]:
     """Colours (V, 3) that stay, and shares (V, 5, 3) of paints: the coat's colours are linear in its paints."""
 
-    def seen(**one: _Color) -> Array:
-        black: dict[str, _Color] = dict.fromkeys(_PAINTS, (0.0, 0.0, 0.0))
-        return Coat(anatomy, CoatParameters(**{**black, **one}, coverage=0.0), 0, points)(points)
+    def seen(paint: str | None) -> Array:
+        base, patch, muzzle, horn, hoof = ((float(paint == name),) * 3 for name in _PAINTS)
+        return Coat(anatomy, CoatParameters(base, patch, muzzle, horn, hoof, coverage=0.0), 0, points)(points)
 
-    fixed = seen()
-    shares = np.stack([seen(**{paint: (1.0, 1.0, 1.0)}) - fixed for paint in _PAINTS], 1)
+    fixed = seen(None)
+    shares = np.stack([seen(paint) - fixed for paint in _PAINTS], 1)
     return torch.from_numpy(fixed).float(), torch.from_numpy(shares).float()
 
 

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -37,7 +37,7 @@ SPREAD = 0.2  # x and y of the middle of that box, at most
 _SIDE = 2  # samples of a pixel along each of its sides
 _FACES_AT_64 = 3000  # of a cow in pictures of 64 x 64
 _MOST_FACES = 12_000
-_APART = 0.3  # of the colours of hair and of what is behind it, sRGB
+_APART = 0.33  # of the colours of hair and of what is behind it, sRGB
 _TRIES = 12  # at most, of finding a place where a cow stands out
 _RNG = np.random.Generator
 
@@ -128,22 +128,21 @@ def _photograph(rng: _RNG, side: int) -> _Shot:
 def _picture(
     cow: PaintedCow, size: float, turn: Tensor, middle: Tensor, place: Backdrop, rng: _RNG, side: int
 ) -> tuple[Tensor, Tensor]:
-    """sRGB (3, S, S), and how much of each pixel is cow (S, S)."""
+    """Colours (3, S, S), sRGB, and how much of each pixel is cow (S, S)."""
     camera, light = _camera(rng), _light(rng)
     verts, normals = (_turned(points, turn) for points in (cow.cow.verts, cow.cow.normals))
     verts = size * verts + middle
     floor = float(verts[:, 2].min())
     fine = side * _SIDE
-    rasterizer = camera.rasterizer(fine)
     seen = sights(place, camera.eye, camera.rays(fine), floor)
-    shadow = _shadow(rasterizer, verts, cow.cow.faces, light, floor, fine)
+    shadow = _shadow(camera.rasterizer(side), verts, cow.cow.faces, light, floor)
     near = _nearness(seen.place, cow.cow, size, turn, middle)
     radiance = _lit(seen, light, shadow, near)
     bounced = linear(place.ground.colors).mean(0) * 0.5
     up = ((verts[:, 2:] - floor) / (2 * size)).clamp(0, 1)
     below = 0.55 + 0.45 * (up / 0.4).clamp(0, 1)  # between its legs a cow is in its own shadow
     colors = cow.colors.pow(2.2) * light.on(normals, bounced) * below
-    hit, shown = _seen_cow(rasterizer, verts, cow.cow.faces, colors)
+    hit, shown = _seen_cow(camera.rasterizer(fine), verts, cow.cow.faces, colors)
     radiance[hit] = shown
     covered = torch.zeros(fine * fine)
     covered[hit] = 1
@@ -165,17 +164,15 @@ def _lit(seen: Sights, light: _Light, shadow: Tensor, near: Tensor) -> Tensor:
     return seen.albedo * (direct * open_to_sun[:, None] + around * open_to_sky[:, None]) + seen.glow
 
 
-def _shadow(
-    rasterizer: MeshRasterizer, verts: Tensor, faces: Tensor, light: _Light, floor: float, fine: int
-) -> Tensor:
-    """How much of the sun a cow takes from the ground (R,), as the ground is seen."""
+def _shadow(rasterizer: MeshRasterizer, verts: Tensor, faces: Tensor, light: _Light, floor: float) -> Tensor:
+    """How much of the sun a cow takes from the ground (R,), as the ground is seen; soft, so a sample a pixel does."""
     above = verts[:, 2:] - floor
     fallen = verts - light.towards * (above / light.towards[2])
-    dark = (rasterizer(Meshes([fallen], [faces])).pix_to_face[..., 0] >= 0).float()
-    reach = max(1, round(light.softness * fine / 2))
+    dark = (rasterizer(Meshes([fallen], [faces])).pix_to_face[..., 0] >= 0)[None].float()
+    reach = max(1, round(light.softness * dark.shape[-1] / 2))
     for _ in range(2):
         dark = F.avg_pool2d(dark, 2 * reach + 1, stride=1, padding=reach)
-    return dark.flatten()
+    return F.interpolate(dark, scale_factor=_SIDE, mode="bilinear").flatten()
 
 
 def _nearness(places: Tensor, cow: Cow, size: float, turn: Tensor, middle: Tensor) -> Tensor:
