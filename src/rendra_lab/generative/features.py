@@ -87,10 +87,10 @@ class FeatureNetwork(ABC):
 class Lite0Features(FeatureNetwork):
     """EfficientNet-Lite0 of ImageNet behind its last block, averaged over the places: 320 numbers.
 
-    The 1,280 of its head would ask for more pictures than an evaluation in between makes: a covariance needs more
-    pictures than numbers. The network was trained at 224 pixels; at 128 it takes a third of the time, and small
-    pictures are enlarged less. Scores are called fd_lite0 and kid_lite0; they are no FID, and at another side they
-    are other numbers.
+    The 1,280 of its head would ask for more pictures than are made for a score in the middle of a fit: a covariance
+    needs more pictures than numbers. The network was trained at 224 pixels; at 128 it takes a third of the time, and
+    small pictures are enlarged less. Scores are called fd_lite0 and kid_lite0; they are no FID, and at another side
+    they are other numbers.
 
     Args:
         side: pixels to which pictures are resized.
@@ -111,7 +111,7 @@ class Lite0Features(FeatureNetwork):
 
     def _vectors(self, network: nn.Module, pictures: Tensor) -> Tensor:
         assert isinstance(network, EfficientNetLite0)
-        return network.levels(pictures)[-1].mean((2, 3))
+        return network.levels(pictures.contiguous(memory_format=torch.channels_last))[-1].mean((2, 3))
 
     def _weights(self) -> str:
         return _file_content(weights_file())
@@ -163,6 +163,8 @@ def eight_bit(pictures: Tensor) -> Tensor:
     if pictures.ndim != 4 or pictures.shape[1] != 3 or 0 in pictures.shape[2:] or not pictures.is_floating_point():
         what = f"{str(pictures.dtype).removeprefix('torch.')} {tuple(pictures.shape)}"
         raise ValueError(f"features are seen in pictures (B, 3, H, W) of numbers in [0, 1], got {what}")
+    if not bool(pictures.isfinite().all()):
+        raise ValueError("features are seen in pictures of finite numbers, got NaN or infinity")
     return (pictures.detach().clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -194,7 +196,7 @@ def _remember(key: tuple[str, str], vectors: Tensor) -> None:
 @lru_cache(maxsize=2)
 def _lite0(device: torch.device) -> EfficientNetLite0:
     with untouched():
-        return EfficientNetLite0.pretrained().to(device)
+        return EfficientNetLite0.pretrained().folded().to(device)
 
 
 @lru_cache(maxsize=2)

