@@ -66,7 +66,7 @@ class MadePictures(TensorRecord):
     """Pictures of scenes, and whose their pixels are."""
 
     rgb: Float[Tensor, "B 3 S S"]
-    shares: Float[Tensor, "B N+1 V V"]  # of each object, and last of the background, in a pixel's features; sum <= 1
+    shares: Float[Tensor, "B T V V"]  # of T = N + 1 things, the background last, in the features of pixels; sum <= 1
 
 
 @dataclass(frozen=True)
