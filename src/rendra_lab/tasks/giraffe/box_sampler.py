@@ -53,9 +53,9 @@ class BoxSampler:
     def __init__(
         self,
         objects: Positive = 1,
-        scale: tuple[_Corner, _Corner] = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
-        translation: tuple[_Corner, _Corner] = ((-0.75, -0.75, 0.0), (0.75, 0.75, 0.0)),
-        turns: tuple[float, float] = (0.0, 1.0),
+        scale: Sequence[_Corner] = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+        translation: Sequence[_Corner] = ((-0.75, -0.75, 0.0), (0.75, 0.75, 0.0)),
+        turns: Sequence[float] = (0.0, 1.0),
         one_size: bool = True,
         counts: Sequence[Amount] | None = None,
         plane: float | None = None,
@@ -65,6 +65,8 @@ class BoxSampler:
         layouts: str | Path | None = None,
         layout_scale: float = 0.2378777237835723,
     ) -> None:
+        if len(turns) != 2:
+            raise UserError(f"boxes.turns must be two numbers, the least and the greatest, got {list(turns)}")
         if objects < 1:
             raise UserError(f"boxes.objects must be at least 1, got {objects}")
         self.objects = objects
@@ -205,9 +207,10 @@ def _between(ends: tuple[Tensor, Tensor], parts: Tensor) -> Tensor:
     return low + parts * (high - low)
 
 
-def _ends(name: str, given: tuple[_Corner, _Corner], least: float = -math.inf) -> tuple[Tensor, Tensor]:
-    low, high = (torch.tensor([float(number) for number in end]) for end in given)
-    if low.shape != (3,) or high.shape != (3,) or bool((low > high).any()) or bool((low <= least).any()):
+def _ends(name: str, given: Sequence[_Corner], least: float = -math.inf) -> tuple[Tensor, Tensor]:
+    low, high = (torch.tensor([float(number) for number in end]) for end in (given[0], given[-1]))
+    is_pair = len(given) == 2 and low.shape == high.shape == (3,)
+    if not is_pair or bool((low > high).any()) or bool((low <= least).any()):
         positive = "" if math.isinf(least) else " above 0"
         raise UserError(
             f"boxes.{name} must be two lists of x, y, z{positive}, the least and the greatest, got {given}"

@@ -6,6 +6,7 @@ Niemeyer and Geiger, "GIRAFFE", CVPR 2021, and the published code. A turn is 2 p
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import torch
@@ -50,16 +51,21 @@ class CameraSampler:
     def __init__(
         self,
         fov_deg: _Fov = 49.13,
-        radius: tuple[Size, Size] = (2.732, 2.732),
-        azimuth: tuple[float, float] = (0.0, 0.0),
-        polar: tuple[Fraction, Fraction] = (0.25, 0.25),
-        background_turns: tuple[float, float] = (0.0, 0.0),
+        radius: Sequence[Size] = (2.732, 2.732),
+        azimuth: Sequence[float] = (0.0, 0.0),
+        polar: Sequence[Fraction] = (0.25, 0.25),
+        background_turns: Sequence[float] = (0.0, 0.0),
         end_points_included: bool = False,
         batch_normalized_look_at: bool = False,
         one_background_turn: bool = False,
     ) -> None:
         if not 0 < fov_deg < 180:
             raise UserError(f"cameras.fov_deg must be above 0 and below 180, got {fov_deg}")
+        ranges = {"radius": radius, "azimuth": azimuth, "polar": polar, "background_turns": background_turns}
+        if wrong := [name for name, ends in ranges.items() if len(ends) != 2]:
+            raise UserError(
+                f"cameras.{wrong[0]} must be two numbers, the least and the greatest, got {list(ranges[wrong[0]])}"
+            )
         if not 0 < radius[0] <= radius[1] or not 0 <= polar[0] <= polar[1] <= 1:
             raise UserError(
                 "cameras.radius must be two numbers above 0 and cameras.polar two from 0 to 1, the least first, got "
