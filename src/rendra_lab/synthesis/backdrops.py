@@ -24,6 +24,7 @@ from rendra_lab.synthesis.surface_pictures import GAMMA
 EDITION = 1  # of the places
 
 _TILE, _TILES = 256, 8  # cells along a side of a tile of noise, and how many there are
+_FINE_UNTIL = 8.0  # away: from there on less than half of the grain is seen
 _RNG = np.random.Generator
 _Color = npt.NDArray[np.float64]
 _Pair = tuple[float, float]
@@ -63,6 +64,7 @@ class Backdrop:
         height: of the wall above the ground.
         ragged: how much that varies, and the length of that.
         turn: of the wall about up, radians.
+        grain_turn: of the ground's noise.
         seamless: from 0 to 1, the wall is lit as the ground is: a sheet of paper.
         sky: (2, 3) sRGB at the horizon and above.
         clouds: how white the sky is in places.
@@ -77,6 +79,7 @@ class Backdrop:
     height: float
     ragged: _Pair
     turn: float
+    grain_turn: float
     seamless: float
     sky: _Color
     clouds: float
@@ -121,11 +124,13 @@ def sights(backdrop: Backdrop, eye: Float[Tensor, " 3"], rays: Float[Tensor, "R 
     far = torch.where(on_wall, to_wall, to_ground).clamp_max(1e4)
     place = eye + far[:, None] * rays
     albedo = torch.zeros_like(rays)
+    on_plane = place[:, :2] @ _turn(backdrop.grain_turn)
     for number, (surface, where, flat) in enumerate(
-        ((backdrop.wall, on_wall, torch.stack([u, height], 1)), (backdrop.ground, on_ground, place[:, :2]))
+        ((backdrop.wall, on_wall, torch.stack([u, height], 1)), (backdrop.ground, on_ground, on_plane))
     ):
         rows = where.nonzero()[:, 0]
-        albedo[rows] = _albedo(surface, flat.index_select(0, rows), backdrop, number)
+        fading = 1 / (1 + (far[rows] / _FINE_UNTIL).square())
+        albedo[rows] = _albedo(surface, flat.index_select(0, rows), fading, backdrop, number)
     left = torch.exp(-(far - eye.norm()).clamp_min(0) / backdrop.haze)[:, None]
     left = torch.where((on_wall | on_ground)[:, None], left, 0.0)
     facing = F.normalize(torch.lerp(normal, normal.new_tensor([0.0, 0.0, 1.0]), backdrop.seamless), dim=0)
@@ -147,8 +152,14 @@ def _distance(by: Tensor, a_unit: Tensor) -> Tensor:
 
 def _wall_axes(backdrop: Backdrop) -> tuple[Tensor, Tensor]:
     """Towards who looks, and along the wall."""
-    cos, sin = float(np.cos(backdrop.turn)), float(np.sin(backdrop.turn))
-    return torch.tensor([cos, sin, 0.0]), torch.tensor([-sin, cos, 0.0])
+    axes = F.pad(_turn(backdrop.turn), (0, 1))
+    return axes[0], axes[1]
+
+
+def _turn(radians: float) -> Tensor:
+    """Rows: x and y turned about z."""
+    cos, sin = float(np.cos(radians)), float(np.sin(radians))
+    return torch.tensor([[cos, sin], [-sin, cos]])
 
 
 def _top(backdrop: Backdrop, u: Tensor) -> Tensor:
@@ -159,14 +170,14 @@ def _top(backdrop: Backdrop, u: Tensor) -> Tensor:
     return backdrop.height + strength * _noise(places, backdrop.tiles[0])
 
 
-def _albedo(surface: Surface, places: Tensor, backdrop: Backdrop, which: int) -> Tensor:
-    """Colours (R, 3) at places (R, 2) of a plane."""
+def _albedo(surface: Surface, places: Tensor, fading: Tensor, backdrop: Backdrop, which: int) -> Tensor:
+    """Colours (R, 3) at places (R, 2) of a plane, whose grain is fading (R,) with distance."""
     shift = torch.from_numpy(backdrop.shift).float()
     coarse = _noise(places / torch.tensor(surface.period) + shift[:2], backdrop.tiles[which])
     fine = _noise(places / torch.tensor(surface.grain_period) + shift[2:], backdrop.tiles[1 - which])
     first, second = linear(surface.colors)
     mixed = torch.lerp(first, second, (0.5 + 0.4 * surface.contrast * coarse).clamp(0, 1)[:, None])
-    shade = (1 + surface.grain * fine).clamp(0.2, 1.8)
+    shade = (1 + surface.grain * fading * fine).clamp(0.2, 1.8)
     return (mixed * (shade * _joints(surface, places))[:, None]).clamp(0, 0.95)
 
 
@@ -244,6 +255,7 @@ def _place(ground: Surface, wall: Surface, distance: float, height: float, rng: 
         height=height,
         ragged=(0.0, 1.0),
         turn=float(rng.uniform(-0.12, 0.12)),
+        grain_turn=float(rng.uniform(0.3, 1.27)),  # never along the view: repetition would show
         seamless=0.0,
         sky=np.stack([pale, blue]),
         clouds=float(rng.choice([0.0, 0.5, 0.9])),

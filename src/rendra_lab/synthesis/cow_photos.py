@@ -8,7 +8,8 @@ Letters: S x S pixels of a picture, R samples of it, V vertices.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from rendra.renderer import MeshRasterizer, PerspectiveCameras, RasterizationSettings
+from rendra.renderer import Fragments, MeshRasterizer, PerspectiveCameras, RasterizationSettings
 from rendra.structures import Meshes
 from rendra_lab.records import TensorRecord
 from rendra_lab.synthesis import backdrops, cow_herd
@@ -34,6 +35,7 @@ POLAR = (0.33, 0.45)  # v, least and most: the camera's polar angle is arccos(1 
 HALF_LENGTH = (0.17, 0.23)  # of the longest side of the box about a cow, least and most
 SPREAD = 0.2  # x and y of the middle of that box, at most
 
+_HALF_WIDTH = math.tan(math.radians(FOV_DEG) / 2)  # of what is seen, at a distance of 1
 _SIDE = 2  # samples of a pixel along each of its sides
 _FACES_AT_64 = 3000  # of a cow in pictures of 64 x 64
 _MOST_FACES = 12_000
@@ -51,16 +53,12 @@ class _Camera(TensorRecord):
 
     def rays(self, side: int) -> Float[Tensor, "R 3"]:
         """Through the middles of side x side samples, row by row, one long along the axis."""
-        across = (2 * (torch.arange(side) + 0.5) / side - 1) * math.tan(math.radians(FOV_DEG) / 2)
-        y, x = torch.meshgrid(-across, across, indexing="ij")
-        return torch.stack([x, y, -torch.ones_like(x)], -1).reshape(-1, 3) @ self.axes.T
+        return _rays(side) @ self.axes.T
 
     def rasterizer(self, side: int) -> MeshRasterizer:
         """Of side x side samples; rendra's axes are x left, y up, z forwards."""
         turn = self.axes * torch.tensor([-1.0, 1.0, -1.0])
-        cameras = PerspectiveCameras(
-            focal_length=1 / math.tan(math.radians(FOV_DEG) / 2), R=turn[None], T=-(self.eye @ turn)[None]
-        )
+        cameras = PerspectiveCameras(1 / _HALF_WIDTH, R=turn[None], T=-(self.eye @ turn)[None])
         return MeshRasterizer(cameras, RasterizationSettings(image_size=side))
 
 
@@ -94,7 +92,8 @@ class CowWorld:
             seeds: of all choices.
             side: S.
         """
-        shots = [_photograph(np.random.default_rng(seed), side) for seed in seeds]
+        with _one_thread():
+            shots = [_photograph(np.random.default_rng(seed), side) for seed in seeds]
         return ObjectPictures(
             rgb=torch.stack([shot.rgb for shot in shots]) if shots else torch.zeros(0, 3, side, side).byte(),
             owners=torch.stack([shot.owners for shot in shots]) if shots else torch.zeros(0, side, side).byte(),
@@ -134,15 +133,17 @@ def _picture(
     verts = size * verts + middle
     floor = float(verts[:, 2].min())
     fine = side * _SIDE
+    fallen = verts - light.towards * ((verts[:, 2:] - floor) / light.towards[2])
+    fragments = camera.rasterizer(fine)(Meshes([verts, fallen], [cow.cow.faces] * 2))
+    shadow = _softened(fragments.pix_to_face[1:, ..., 0] >= 0, light.softness)
     seen = sights(place, camera.eye, camera.rays(fine), floor)
-    shadow = _shadow(camera.rasterizer(side), verts, cow.cow.faces, light, floor)
     near = _nearness(seen.place, cow.cow, size, turn, middle)
     radiance = _lit(seen, light, shadow, near)
     bounced = linear(place.ground.colors).mean(0) * 0.5
     up = ((verts[:, 2:] - floor) / (2 * size)).clamp(0, 1)
     below = 0.55 + 0.45 * (up / 0.4).clamp(0, 1)  # between its legs a cow is in its own shadow
     colors = cow.colors.pow(2.2) * light.on(normals, bounced) * below
-    hit, shown = _seen_cow(camera.rasterizer(fine), verts, cow.cow.faces, colors)
+    hit, shown = _seen_cow(fragments, cow.cow.faces, colors)
     radiance[hit] = shown
     covered = torch.zeros(fine * fine)
     covered[hit] = 1
@@ -164,15 +165,13 @@ def _lit(seen: Sights, light: _Light, shadow: Tensor, near: Tensor) -> Tensor:
     return seen.albedo * (direct * open_to_sun[:, None] + around * open_to_sky[:, None]) + seen.glow
 
 
-def _shadow(rasterizer: MeshRasterizer, verts: Tensor, faces: Tensor, light: _Light, floor: float) -> Tensor:
-    """How much of the sun a cow takes from the ground (R,), as the ground is seen; soft, so a sample a pixel does."""
-    above = verts[:, 2:] - floor
-    fallen = verts - light.towards * (above / light.towards[2])
-    dark = (rasterizer(Meshes([fallen], [faces])).pix_to_face[..., 0] >= 0)[None].float()
-    reach = max(1, round(light.softness * dark.shape[-1] / 2))
+def _softened(dark: Tensor, softness: float) -> Tensor:
+    """How much of the sun a cow takes from what samples show (R,), of those (1, R/S, R/S) that it takes it from."""
+    share = F.avg_pool2d(dark[None].float(), _SIDE)
+    reach = max(1, round(softness * share.shape[-1] / 2))
     for _ in range(2):
-        dark = F.avg_pool2d(dark, 2 * reach + 1, stride=1, padding=reach)
-    return F.interpolate(dark, scale_factor=_SIDE, mode="bilinear").flatten()
+        share = F.avg_pool2d(share, 2 * reach + 1, stride=1, padding=reach)
+    return F.interpolate(share, scale_factor=_SIDE, mode="bilinear").flatten()
 
 
 def _nearness(places: Tensor, cow: Cow, size: float, turn: Tensor, middle: Tensor) -> Tensor:
@@ -181,13 +180,12 @@ def _nearness(places: Tensor, cow: Cow, size: float, turn: Tensor, middle: Tenso
     return 0.65 * torch.exp(-1.6 * own.square().sum(1))
 
 
-def _seen_cow(rasterizer: MeshRasterizer, verts: Tensor, faces: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples that show the cow, and its colours there."""
-    fragments = rasterizer(Meshes([verts], [faces]))
-    face = fragments.pix_to_face.flatten()
+def _seen_cow(fragments: Fragments, faces: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+    """Samples of the first picture that show the cow, and its colours there."""
+    face = fragments.pix_to_face[0].flatten()
     hit = (face >= 0).nonzero()[:, 0]
     corners = colors.index_select(0, faces.index_select(0, face[hit]).flatten()).reshape(-1, 3, 3)
-    weights = fragments.bary_coords.reshape(-1, 3).index_select(0, hit)
+    weights = fragments.bary_coords[0].reshape(-1, 3).index_select(0, hit)
     return hit, (weights[..., None] * corners).sum(1)
 
 
@@ -231,6 +229,25 @@ def _fitting_place(cow: PaintedCow, rng: _RNG) -> Backdrop:
 def _faces(side: int) -> int:
     """Of a cow, for pictures of a side."""
     return min(_MOST_FACES, max(_FACES_AT_64, _FACES_AT_64 * side // 64))
+
+
+@lru_cache(maxsize=4)
+def _rays(side: int) -> Tensor:
+    """Through the middles of samples (R, 3), in the camera's axes."""
+    across = (2 * (torch.arange(side) + 0.5) / side - 1) * _HALF_WIDTH
+    y, x = torch.meshgrid(-across, across, indexing="ij")
+    return torch.stack([x, y, -torch.ones_like(x)], -1).reshape(-1, 3)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For what is so small that threads wait for each other longer than they work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @lru_cache(maxsize=BUILDS)
