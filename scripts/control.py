@@ -28,7 +28,8 @@ def main(cfg: Any) -> None:
     if (options["run"] is None) == (options["zoo"] is None):
         raise UserError("say run=FOLDER, the folder of a run of task=giraffe, or zoo=NAME, one of those kept in zoo/")
     for name, hint in {**hints_of(Order), "fps": Size}.items():
-        check_value(options[name], hint, name)
+        if name in options:
+            check_value(options[name], hint, name)
     programs = programs_named(str(options["program"]))
     order = Order(**{field.name: options[field.name] for field in fields(Order)})
     if options["run"] is None:

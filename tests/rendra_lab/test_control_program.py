@@ -73,7 +73,6 @@ def test_what_is_kept_is_controlled(
     program: Callable[..., tuple[int, str, str]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     import importlib.util
 

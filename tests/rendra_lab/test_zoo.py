@@ -102,7 +102,7 @@ def test_names_that_cannot_be(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"part": "raw"}, "has no part raw with weights; it has: averaged, other"),
-        ({"key": "module.words"}, r"has no averaged: its task is Toy, whose configuration builds nothing at module\.words"),
+        ({"key": "module.words"}, r"its task is Toy, whose configuration builds nothing at module\.words"),
         ({"part": "other"}, "other of .*run does not fit this configuration"),
     ],
 )  # fmt: skip
