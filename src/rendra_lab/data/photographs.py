@@ -24,7 +24,7 @@ from rendra_lab.data.posed_images import NUM_DISTORTION, PosedImages
 from rendra_lab.errors import UserError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA")  # rasters only: EPS runs a program
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "TGA", "GIF")  # rasters only: EPS runs a program
 _MOST_PIXELS = 8192 * 8192
 _MOST_BYTES = 8 << 30
 _ORIENTATION = 0x0112
@@ -209,7 +209,7 @@ def _read(photograph: Photograph) -> tuple[npt.NDArray[np.uint8], bool]:
 
 
 def decode(path: Path, where: str) -> Image.Image:
-    """A picture of 8 bits a channel, or a palette, as it stands in the file.
+    """A picture of 8 bits a channel, or a palette, as it stands in the file; the first one of several.
 
     Raises:
         UserError: no picture that can be read to its end, or one of floating-point numbers.

@@ -38,16 +38,25 @@ def upright_size(path: Path, where: str) -> tuple[int, int]:
     return (width, height) if _orientation(path) >= 5 else (height, width)
 
 
-def read_upright(path: Path, where: str) -> npt.NDArray[np.uint8]:
-    """Colours (H, W, 3), sRGB, as people look at the picture.
+def upright(path: Path, where: str) -> Image.Image:
+    """The picture as people look at it; colours as `decode` has them.
 
     Raises:
         UserError: no file, no picture, a huge one, or one that ends too soon; `where` names who asks.
     """
     image_size(path, where)
-    image = decode(path, where).convert("RGB")
+    image = decode(path, where)
     turn = _TURNS.get(_orientation(path))
-    return np.array(image if turn is None else image.transpose(turn))
+    return image if turn is None else image.transpose(turn)
+
+
+def read_upright(path: Path, where: str) -> npt.NDArray[np.uint8]:
+    """Colours (H, W, 3), sRGB, as people look at the picture.
+
+    Raises:
+        UserError: as `upright`.
+    """
+    return np.array(upright(path, where).convert("RGB"))
 
 
 def find_picture(folder: Path, names: tuple[str, ...], where: str) -> Path | None:
@@ -70,8 +79,9 @@ def find_picture(folder: Path, names: tuple[str, ...], where: str) -> Path | Non
 
 
 def _orientation(path: Path) -> int:
+    """How a picture is yet to be turned; Pillow itself turns TIFF files."""
     try:
         with Image.open(path) as image:
-            return int(image.getexif().get(_ORIENTATION, 1))
+            return 1 if image.format == "TIFF" else int(image.getexif().get(_ORIENTATION, 1))
     except Exception:  # whatever the decoder says of the EXIF data, then they turn nothing
         return 1
