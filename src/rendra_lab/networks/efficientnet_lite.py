@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from rendra_lab.errors import UserError
@@ -79,7 +80,7 @@ class EfficientNetLite0(nn.Module):
                 if hasattr(part, convolution):
                     setattr(part, convolution, fuse_conv_bn_eval(getattr(part, convolution), getattr(part, norm)))
                     setattr(part, norm, nn.Identity())
-        return network.to(memory_format=torch.channels_last)
+        return convert_conv2d_weight_memory_format(network, torch.channels_last)
 
     def levels(self, images: Tensor, count: int = len(_LEVELS)) -> list[Tensor]:
         """What the last block of each resolution sees.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from few_numbers import Quarters, tiny
 
 from rendra_lab.generative import feature_statistics
@@ -13,6 +14,9 @@ from rendra_lab.generative.feature_statistics import FeatureStatistics, referenc
 from rendra_lab.generative.frechet import FrechetDistance, distance_of_statistics
 from rendra_lab.generative.kernel_distance import KernelDistance, kernel_distance
 from rendra_lab.generative.terms import generative_term
+from rendra_lab.targets import check_targets
+
+CONF = Path(__file__).parents[3] / "conf" / "metric"
 
 KINDS = pytest.mark.parametrize("kind", [FrechetDistance, KernelDistance])
 Kind = type[FrechetDistance] | type[KernelDistance]
@@ -147,3 +151,11 @@ def test_terms_are_left_out_without_a_network() -> None:
     assert isinstance(term.fn, KernelDistance)
     term({"rgb": tiny(4, 1)}, {})
     assert term.fn.counts() == (4, 0)
+
+
+@pytest.mark.parametrize("name", ["generative", "fid"])
+def test_what_is_configured_may_be_called(name: str) -> None:
+    terms = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    check_targets(terms)
+    for key, term in terms.items():
+        assert term["distance"] == ("kernel" if key.startswith("kid") else "frechet")
