@@ -61,7 +61,7 @@ def sgd(parameters: Any) -> torch.optim.Optimizer:
     return torch.optim.SGD(parameters, lr=_RATE)
 
 
-def painter(**parts: Any) -> Painter:
+def parts_of_painter(**parts: Any) -> dict[str, Any]:
     defaults: dict[str, Any] = {
         "losses": {
             "l1": LossTerm(lambda made, real: (made - real).abs().mean(), weight=0.5),
@@ -75,7 +75,11 @@ def painter(**parts: Any) -> Painter:
         },
         "adversary_optimizer": sgd,
     }
-    return Painter(**{**defaults, **parts})
+    return {**defaults, **parts}
+
+
+def painter(**parts: Any) -> Painter:
+    return Painter(**parts_of_painter(**parts))
 
 
 def fit(task: Painter, steps: int, *callbacks: Any) -> pl.Trainer:
@@ -94,6 +98,64 @@ def test_a_step_moves_both_by_the_gradients_at_its_beginning() -> None:
     assert isinstance(task.adversary, Adversary)
     assert float(task.adversary.weight.detach()) == pytest.approx(2.0 - _RATE * (0.1 - _REAL))  # of the shade before
     assert trainer.global_step == 1
+
+
+class Turns(Painter):
+    """Remembers whose turn it was."""
+
+    def predict(self, batch: Pictures) -> Pictures:
+        vars(self).setdefault("seen", []).append((self.global_step, self.turn, torch.is_grad_enabled()))
+        return super().predict(batch)
+
+
+def test_in_turn_the_adversary_sees_what_the_generator_makes_after_its_update() -> None:
+    task = Turns(**parts_of_painter(in_turn=True))
+    trainer = fit(task, 1)
+    moved = 0.1 + _RATE * (0.5 + 3.0 * 2.0)
+    assert float(task.shade.detach()) == pytest.approx(moved)
+    assert isinstance(task.adversary, Adversary)
+    assert float(task.adversary.weight.detach()) == pytest.approx(2.0 - _RATE * (moved - _REAL))
+    assert trainer.global_step == 1
+    assert task.seen == [(0, 0, True), (1, 1, False)]
+    assert task.turn == 0
+
+
+def test_in_turn_schedulers_step_once_and_steps_count_once() -> None:
+    task = painter(in_turn=True, scheduler=lambda optimizer: torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5))
+    trainer = fit(task, 3)
+    assert trainer.global_step == 3
+    assert [each.param_groups[0]["lr"] for each in trainer.optimizers] == [_RATE / 8] * 2
+
+
+def test_gradient_norms_are_logged_and_what_a_task_makes_of_verdicts() -> None:
+    class Talking(Painter):
+        def verdicts(self, fake: Tensor, real: Tensor) -> dict[str, Tensor]:
+            return {"trust": real - fake}
+
+    trainer = fit(Talking(**parts_of_painter()), 1)
+    logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    assert logged["train/gradient_norm"] == pytest.approx(0.5 + 3.0 * 2.0)
+    assert logged["train/adversary_gradient_norm"] == pytest.approx(_REAL - 0.1)
+    assert logged["train/trust"] == pytest.approx(2.0 * (_REAL - 0.1))
+
+
+def test_a_term_of_the_adversary_may_ask_for_gradients_at_real_pictures() -> None:
+    def slope(real: Tensor, pictures: Tensor) -> Tensor:
+        (gradient,) = torch.autograd.grad(real, pictures, create_graph=True)
+        return gradient.square().sum()
+
+    term = LossTerm(slope, weight=4.0, prediction=None, target="real", context={"pictures": "real_pictures"}, every=2)
+    task = painter(adversary_losses={**painter().adversary_losses, "slope": term})
+    trainer = fit(task, 1)
+    pixels = 2 * 3 * 4 * 4  # the slope is that of a mean: weight / pixels in each
+    assert float(trainer.callback_metrics["train/loss_slope"]) == pytest.approx(2.0**2 / pixels)
+    assert isinstance(task.adversary, Adversary)
+    expected = 2.0 - _RATE * (0.1 - _REAL + 2 * 4.0 * 2 * 2.0 / pixels)
+    assert float(task.adversary.weight.detach()) == pytest.approx(expected)
+    pictures = Pictures(torch.full((2, 3, 4, 4), _REAL))
+    assert set(task._adversary_objective(pictures, pictures, 1)[1]) == {
+        "train/adversary_loss", "train/loss_trusts", "train/loss_doubts",
+    }  # fmt: skip
 
 
 def test_steps_are_those_of_the_fit_not_of_its_optimizers() -> None:

@@ -49,7 +49,17 @@ _FEW_SHAPES = (
     "callbacks.shapes.pictures=1",
     "callbacks.shapes.samples=500",
 )
+_FEW_PICTURES = (
+    "data.counts=[2,2,2]",
+    "data.batch_size=2",
+    "data.cache=null",
+    "callbacks.images.every_n_steps=0",
+    "callbacks.animation=null",
+    "callbacks.controls.scenes=2",
+    "callbacks.controls.turns=2",
+)
 _OF_TASKS = {
+    "giraffe": _FEW_PICTURES,
     "mask_rcnn": _FEW_ROOMS,
     "mesh_rcnn": _FEW_ROOMS,
     "nerf": _SMALL_SCENE,
@@ -174,7 +184,12 @@ def test_every_experiment_makes_a_step_and_says_how(
     lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[0] == "# @package _global_"
     assert f"python train.py experiment={experiment}" in lines[1]
-    few = {"smplify": _FEW_PEOPLE, "synsin": _FEW_PAIRS, "voxmesh": _FEW_SHAPES}.get(experiment.partition("_")[0], ())
+    few = {
+        "giraffe": _FEW_PICTURES,
+        "smplify": _FEW_PEOPLE,
+        "synsin": _FEW_PAIRS,
+        "voxmesh": _FEW_SHAPES,
+    }.get(experiment.partition("_")[0], ())
     settings = (f"experiment={experiment}", *SMALLER.get(experiment, few))
     assert one_step(compose, tmp_path / "experiment" / "run", *settings)["steps"] >= 1
 

@@ -44,6 +44,11 @@ SMALLER = {
         "module.refine_at=[2,5]",
         "module.samples=200",
     ),
+    "giraffe": (
+        *("data.counts=[12,2,2]", "data.batch_size=4", "data.eval_batch_size=2", "data.cache=null"),
+        *("data.image_size=16", "network.discriminator.picture_side=16", "network.discriminator.widest=16"),
+        *("network.generator.renderer.feature_side=4", "network.generator.renderer.picture_side=16"),
+    ),
     "mask_rcnn": ("data.counts=[4,1,1]", "data.batch_size=2", "callbacks.detections.pictures=0"),
     "nerf": (*_SCENE, *_OCCUPANCY, *_HASHES),
     "volume": (*_SCENE, *_VOLUME),

@@ -6,6 +6,7 @@ from assertions import assert_close
 from torchmetrics import MeanMetric
 
 from rendra_lab import losses, metrics
+from rendra_lab.base_task import weighted_sum
 from rendra_lab.terms import LossTerm, MetricTerm, PiecewiseLinear
 
 PREDICTION = {"rgb": torch.tensor([1.0, 2.0, 4.0]), "other": torch.tensor(3.0)}
@@ -64,3 +65,31 @@ def test_a_metric_is_never_differentiated() -> None:
 def test_a_term_needs_something_to_call() -> None:
     with pytest.raises(TypeError, match="got int"):
         LossTerm(3)  # type: ignore[arg-type]
+
+
+def test_a_costly_term_counts_as_much_when_it_is_counted_now_and_then() -> None:
+    term = LossTerm(losses.absolute_error, weight=[[0, 1.0], [8, 3.0]], every=4)
+    assert [term.is_due(step) for step in range(6)] == [True, False, False, False, True, False]
+    assert [term.weight_at(step) for step in (0, 1, 4, 8, 9)] == [4.0, 0.0, 8.0, 12.0, 0.0]
+    with pytest.raises(ValueError, match="every=0"):
+        LossTerm(losses.absolute_error, every=0)
+
+
+def test_an_objective_leaves_out_what_is_not_due() -> None:
+    terms = torch.nn.ModuleDict(
+        {"always": LossTerm(losses.absolute_error), "lazy": LossTerm(losses.mean_square, target=None, every=2)}
+    )
+    total, values = weighted_sum(terms, PREDICTION, BATCH, 3)
+    assert list(values) == ["always"]
+    assert_close(total, 4 / 3)
+    total, values = weighted_sum(terms, PREDICTION, BATCH, 4)
+    assert_close(total, 4 / 3 + 2 * 7.0)
+    del terms["always"]
+    with pytest.raises(ValueError, match="no loss is due at step 3: lazy; one of them needs every=1"):
+        weighted_sum(terms, PREDICTION, BATCH, 3)
+
+
+def test_a_loss_may_take_the_batch_alone() -> None:
+    term = LossTerm(lambda real, mask: (real * mask).sum(), prediction=None, context={"mask": "mask"})
+    assert_close(term(PREDICTION, BATCH), 2.0)
+    assert [term.reads(name) for name in ("rgb", "mask", "other")] == [True, True, False]

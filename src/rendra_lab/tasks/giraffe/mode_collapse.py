@@ -71,18 +71,18 @@ class ModeCollapseWatcher(Callback):
         """Looks, where it is due."""
         if not isinstance(pl_module, Giraffe) or not every(trainer.global_step, self.every_n_steps):
             return
-        if not self._real or len(self._real[0]) < _FEWEST:
+        real = torch.cat([each.unique(dim=0) for each in self._real] or [torch.zeros(0)])
+        if len(real) < _FEWEST:
             return
-        pairs, nearest = self.varieties(pl_module)
+        pairs, nearest = self.varieties(pl_module, real)
         pl_module.log("train/variety_pairs", pairs, rank_zero_only=True)
         pl_module.log("train/variety_nearest", nearest, rank_zero_only=True)
         if trainer.is_global_zero:
             self._judge(trainer.global_step, pairs, nearest)
 
     @torch.no_grad()
-    def varieties(self, task: Giraffe) -> tuple[float, float]:
-        """Both numbers, of the trained generator's samples beside the newest real pictures."""
-        (real,) = self._real
+    def varieties(self, task: Giraffe, real: Tensor) -> tuple[float, float]:
+        """Both numbers, of the trained generator's samples beside as many different real pictures as `coarse`."""
         scenes = task.generator.sample(len(real), stream(self.seed))
         made = distances(coarse(made_of(task.generator, scenes).rgb))
         true = distances(real)

@@ -52,11 +52,12 @@ class SampleGrid:
 
     @torch.no_grad()
     def drawn(self, generator: Generator) -> dict[str, Tensor]:
-        """What a generator makes of the scenes, as images (B, S, S, 3), sRGB in [0, 1].
+        """What a generator makes of the scenes, as images, sRGB in [0, 1].
 
         Returns:
-            `samples`; `objects`, the share of each object in the pixels, in a colour of its own, and that of the
-            background in dark grey; and `turned`, a row a scene, where there are objects.
+            `samples` (B, S, S, 3); `objects` (B, S, S, 3), the share of each object in the pixels, in a colour of its
+            own, and that of the background in dark grey; and `turned` (turned * S, headings * S, 3), a row a scene,
+            where there are objects.
         """
         scenes = generator.sample(self.samples, stream(self.seed), self.temperature)
         made = made_of(generator, scenes)
@@ -66,11 +67,11 @@ class SampleGrid:
         return images
 
     def _turned(self, generator: Generator, scenes: Scenes) -> Tensor:
-        """Strips (turned, S, headings * S, 3)."""
+        """One image of scenes below each other, their headings side by side."""
         few = chosen(scenes, torch.arange(self.turned, device=scenes.codes.shape.device))
         angles = [2 * math.pi * number / self.headings for number in range(self.headings)]
         views = [made_of(generator, turned(few, 0, angle)).rgb for angle in angles]
-        return torch.cat(views, dim=-1).movedim(1, -1)
+        return torch.cat(views, dim=-1).movedim(1, -1).flatten(0, 1)
 
 
 def made_of(generator: Generator, scenes: Scenes) -> MadePictures:
@@ -93,11 +94,11 @@ def chosen(scenes: Scenes, rows: Tensor) -> Scenes:
     )
 
 
-def share_images(shares: Float[Tensor, "B N+1 V V"], side: int) -> Float[Tensor, "B S S 3"]:
+def share_images(shares: Float[Tensor, "B T V V"], side: int) -> Float[Tensor, "B S S 3"]:
     """Shares in colours: each object has one of its own, the background is dark grey, what nobody has is black.
 
     Args:
-        shares: of each object, and last of the background.
+        shares: of T things: objects, and last the background.
         side: S, pixels.
     """
     objects = shares.shape[1] - 1
