@@ -17,7 +17,8 @@ from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.synsin.hole_filling import filled
 
 _LEAST_COVER = 1e-3  # of a pixel: where there is less, the colour is nobody's
-_TRUST = 4.0  # how much an untrained decoder keeps of covered pixels' colours, before a sigmoid; half of holes'
+_RETOUCHED = 0.1  # of what the decoder would change, where points cover a pixel; holes are its own
+_COVERED = 0.25  # what is covered by so much is no hole
 
 
 class FeatureEncoder(nn.Module):
@@ -65,8 +66,8 @@ class RefinementDecoder(nn.Module):
         resample: of each block, the last included, see `ResidualChain`.
         fold: the blocks see squares of `fold` x `fold` pixels as one, with more channels.
         keep_color: the first four features are colours and how much of a pixel they cover, as `FeatureEncoder`
-            keeps them. Holes take the colours about them; a fourth channel of the last layer says at each pixel how
-            much of that stays, and the tanh paints the rest.
+            keeps them. Holes take the colours about them, and the tanh says how far towards white or black each
+            channel of that moves: little where points fell, as far as it likes in holes.
         noise_seed, noise_std: see `NoiseBatchNorm`.
     """
 
@@ -85,7 +86,7 @@ class RefinementDecoder(nn.Module):
             raise UserError(f"a decoder that keeps colours needs channels of at least 4, got {channels}")
         self.channels = channels
         self.keep_color = keep_color
-        outer = [*widths, (4 if keep_color else 3) * fold**2]
+        outer = [*widths, 3 * fold**2]
         # odd: other noise than the encoder's of the same seed
         self.chain = ResidualChain(channels * fold**2, outer, resample, 2 * noise_seed + 1, noise_std, fold)
 
@@ -102,6 +103,6 @@ class RefinementDecoder(nn.Module):
         weights = features[:, 3:4]
         cover = weights.clamp(0, 1)
         given = filled((features[:, :3] / weights.clamp_min(_LEAST_COVER)).clamp(-1, 1), cover)
-        answer = self.chain(torch.cat([given, features[:, 3:]], 1))
-        picture = torch.lerp(torch.tanh(answer[:, :3]), given, torch.sigmoid(answer[:, 3:] + _TRUST * cover))
-        return 0.5 * picture + 0.5
+        answer = torch.tanh(self.chain(torch.cat([given, features[:, 3:]], 1)))
+        change = torch.lerp(answer, _RETOUCHED * answer, (cover / _COVERED).clamp_max(1))
+        return 0.5 * (given * (1 - change.abs()) + change) + 0.5
