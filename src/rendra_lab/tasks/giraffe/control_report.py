@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
@@ -13,6 +13,7 @@ from rendra_lab.callbacks import writers
 from rendra_lab.settings import Count, Positive, Range, Size
 from rendra_lab.tasks.giraffe.control_table import TITLES, results
 from rendra_lab.tasks.giraffe.disentanglement import Findings, Probe, Views, means_of, measure
+from rendra_lab.tasks.giraffe.records import PictureBatch
 from rendra_lab.tasks.giraffe.scene_maker import SceneMaker
 from rendra_lab.visualization import Picture
 
@@ -24,7 +25,8 @@ class ControlReport(Callback):
 
     Leaves controls.csv, a row a scene; controls.md, the table, which is printed too; and ../images/controls.png, some
     scenes under each control. Logs the means, `test/turn_background_change`, `test/move_correlation` and so on, and
-    `test/seen`, the share of scenes in which the object is seen, of which they are the means.
+    `test/seen`, the share of scenes in which the object is seen, of which they are the means; beside
+    `test/mask_share` also `test/true_mask_share`, what objects of real pictures cover, where the data know it.
 
     Args:
         folder: of the files.
@@ -49,9 +51,23 @@ class ControlReport(Callback):
         seed: Count = 0,
     ) -> None:
         self.folder = Path(folder)
-        self.on_sheet = on_sheet
-        self.probe = Probe(scenes, turns, temperature=temperature, object=object, threshold=threshold, seed=seed)
+        self.probe = Probe(
+            scenes, turns, temperature=temperature, object=object, threshold=threshold, seed=seed, kept=on_sheet
+        )
         self._findings: Findings | None = None
+        self._true_shares: list[float] = []
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forgets other tests."""
+        self._findings, self._true_shares = None, []
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        """Looks at how large real objects are, where that is known."""
+        if isinstance(batch, PictureBatch) and batch.truth is not None:
+            shares = batch.truth.masks.float().mean((-2, -1))
+            self._true_shares += shares[batch.truth.kind >= 0].tolist()
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Measures, and logs the means."""
@@ -60,7 +76,10 @@ class ControlReport(Callback):
             return
         with random_state.untouched():
             self._findings = measure(maker, self.probe)
-        for name, value in means_of(self._findings.rows).items():
+        means = means_of(self._findings.rows)
+        if self._true_shares:
+            means["true_mask_share"] = sum(self._true_shares) / len(self._true_shares)
+        for name, value in means.items():
             pl_module.log(f"test/{name}", value, rank_zero_only=True)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -69,20 +88,21 @@ class ControlReport(Callback):
             return
         rows = self._findings.rows
         report.write_csv(self.folder / "controls.csv", [{"scene": i, **row} for i, row in enumerate(rows)])
-        text = results(rows, self.probe)
+        true_share = sum(self._true_shares) / len(self._true_shares) if self._true_shares else None
+        text = results(rows, self.probe, true_share)
         report.write_text(self.folder / "controls.md", text)
         report.say(text)
-        if self.on_sheet:
-            drawn = sheet(self._findings.views, self.on_sheet)
+        if self.probe.kept:
+            drawn = sheet(self._findings.views)
             visualization.save_picture(self.folder.parent / "images" / "controls.png", drawn)
             for writer in writers(trainer):
                 writer.add_image("test/controls", drawn, trainer.global_step, dataformats="HWC")
         self._findings = None
 
 
-def sheet(views: dict[str, Views], scenes: int) -> Picture:
-    """Some scenes under each control: a block a control, in which a row is a scene."""
-    blocks = [visualization.caption(_block(view.rgb[:, :scenes]), TITLES[name]) for name, view in views.items()]
+def sheet(views: dict[str, Views]) -> Picture:
+    """Scenes under each control: a block a control, in which a row is a scene."""
+    blocks = [visualization.caption(_block(view.rgb), TITLES[name]) for name, view in views.items()]
     return visualization.tile(blocks, columns=2)
 
 

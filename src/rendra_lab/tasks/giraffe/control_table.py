@@ -18,8 +18,14 @@ TITLES = {
 """What controls are called in tables and on sheets."""
 
 
-def results(rows: Sequence[Row], probe: Probe) -> str:
-    """The means of some scenes as a table in Markdown: controls by what changed, and how they were followed."""
+def results(rows: Sequence[Row], probe: Probe, true_share: float | None = None) -> str:
+    """The means of some scenes as a table in Markdown: controls by what changed, and how they were followed.
+
+    Args:
+        rows: of the scenes.
+        probe: how they were measured.
+        true_share: of a picture that a real object covers; None where nobody knows.
+    """
     means = means_of(list(rows))
     table = [["", "object pixels change", "background pixels change", "as commanded"]]
     for control, title in TITLES.items():
@@ -28,11 +34,12 @@ def results(rows: Sequence[Row], probe: Probe) -> str:
     seen = sum(row["seen"] or 0.0 for row in rows)
     share = _percent(means.get("mask_share"))
     head = f"# Controls of {len(rows)} scenes, in {seen:.0f} of which the object is seen"
+    beside = "" if true_share is None else f"; a real one covers {_percent(true_share)}"
     notes = [
         "Changes in % of the range of a colour, mean over pixels; 0 is as it was. What a control does not name "
         "should stay: the background of the first five rows, the object of the last.",
         f"An object is where its picture changes by more than {probe.threshold:g} when it is taken away: {share} of "
-        f"the picture. Codes at temperature {probe.temperature:g}.",
+        f"the picture{beside}. Codes at temperature {probe.temperature:g}.",
     ]
     return "\n".join([head, "", *markdown_table(table), "", *notes]) + "\n"
 

@@ -47,6 +47,7 @@ class Probe:
         temperature: of their codes.
         threshold: of a change that shows the object, of a range of 1.
         at_once: scenes of a batch.
+        kept: scenes of the first batch whose pictures are kept.
     """
 
     scenes: Positive = 64
@@ -59,6 +60,7 @@ class Probe:
     temperature: Size = 0.65
     threshold: Size = 0.1
     at_once: Positive = 16
+    kept: Count = 4
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,19 @@ class Views:
     rgb: Float[Tensor, "K B 3 S S"]
     masks: Bool[Tensor, "K B S S"]  # where the object is
 
+    def of(self, scenes: int) -> Views:
+        """Of the first scenes alone, in memory of their own."""
+        return Views(self.rgb[:, :scenes].clone(), self.masks[:, :scenes].clone())
+
 
 @dataclass(frozen=True)
 class Findings:
     """What was measured, and seen meanwhile."""
 
     rows: list[Row]
-    views: dict[str, Views]  # by control: turn, move, scale, appearance, shape, background; of the first batch
+    views: dict[
+        str, Views
+    ]  # by control: turn, move, scale, appearance, shape, background; of the scenes that are kept
 
 
 def measure(maker: SceneMaker, probe: Probe) -> Findings:
@@ -92,7 +100,7 @@ def measure(maker: SceneMaker, probe: Probe) -> Findings:
         must_have(scenes, probe.object)
         views, commands = _controlled(maker, edits.present(scenes, probe.object), others, probe)
         rows += numbers(views, commands)
-        shown = shown or views
+        shown = shown or {name: view.of(probe.kept) for name, view in views.items()}
     return Findings(rows, shown)
 
 

@@ -30,6 +30,7 @@ from rendra_lab.tasks.giraffe.disentanglement import (
     overlap,
     widened,
 )
+from rendra_lab.tasks.giraffe.records import PictureBatch, PictureTruth
 
 PROBE = Probe(scenes=5, turns=4, at_once=3)
 
@@ -145,8 +146,16 @@ def test_a_report_leaves_a_table_numbers_and_a_sheet(
     task = Made()
     task.averaged = Discs()
     report = ControlReport(str(tmp_path / "exports"), scenes=3, on_sheet=2, turns=8)
+    masks = torch.zeros(2, 2, 8, 8, dtype=torch.bool)
+    masks[0, 0, :4] = masks[1, 0, :2] = True
+    kind = torch.tensor([[3, -1], [1, -1]])  # one object each
+    truth = PictureTruth(masks, torch.zeros(2, 2, 4), torch.zeros(2, 2), kind)
+    report.on_test_start(trainer, task)
+    report.on_test_batch_end(trainer, task, None, PictureBatch(torch.rand(2, 3, 8, 8), truth), 0)
+    report.on_test_batch_end(trainer, task, None, PictureBatch(torch.rand(2, 3, 8, 8)), 1)
     report.on_test_epoch_end(trainer, task)
     report.on_test_end(trainer, task)
+    assert task.logged["test/true_mask_share"] == pytest.approx(3 / 8)
     assert task.logged["test/seen"] == 1
     assert task.logged["test/turn_background_change"] == pytest.approx(0, abs=1e-6)
     with (tmp_path / "exports" / "controls.csv").open() as file:
@@ -156,6 +165,7 @@ def test_a_report_leaves_a_table_numbers_and_a_sheet(
     assert text in capsys.readouterr().out
     assert text.startswith("# Controls of 3 scenes, in 3 of which the object is seen")
     assert "place: correlation 1.000, slope" in text
+    assert "of the picture; a real one covers 37.50 %." in text
     with Image.open(tmp_path / "images" / "controls.png") as sheet:
         assert sheet.width > 2 * 5 * 64
         assert sheet.height > 3 * 2 * 64
