@@ -5,8 +5,7 @@ Letters: D numbers of a vector.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rendra_lab.data.kept_tensors import kept_or_made
-from rendra_lab.generative.features import FeatureNetwork, content_of, eight_bit
+from rendra_lab.generative.features import FeatureNetwork
 from rendra_lab.records import read_field
 
 MOST_KEPT = 5_000  # vectors
-_EDITION = "1"  # of what is kept; another one makes all files anew
 
 
 @dataclass(frozen=True)
@@ -74,44 +71,23 @@ def symmetric_root(matrix: Tensor) -> Tensor:
 def reference_statistics(
     features: FeatureNetwork, batches: Iterable[Any], field: str = "rgb", cache: Path | None = None
 ) -> FeatureStatistics:
-    """Of real pictures as a network sees them; made once, and found by content from then on.
+    """Of real pictures as a network sees them.
 
     Args:
         features: the network.
-        batches: of pictures (B, 3, H, W) in [0, 1], or records that have them; gone through once where they are
-            known, and twice where not. Random crops or flips must come out the same each time.
+        batches: of pictures (B, 3, H, W) in [0, 1], or records that have them.
         field: of records: where the pictures are.
-        cache: folder of statistics that were made; None makes them every time.
+        cache: folder in which the vectors of each batch are kept by content; None sees all pictures anew.
 
     Raises:
-        TypeError: something that can be gone through only once.
         ValueError: no picture, or pictures of another shape.
     """
-    if iter(batches) is batches:
-        raise TypeError(f"reference pictures are gone through twice: give a loader or a list, not a {_kind(batches)}")
-    if cache is None:
-        return _made(features, batches, field)
-    path = cache / f"features_{features.name}" / f"{_fingerprint(features, batches, field)}.safetensors"
-
-    def make() -> dict[str, Tensor]:
-        new = _made(features, batches, field)
-        return {
-            "count": torch.tensor(new.count),
-            "mean": new.mean,
-            "covariance": new.covariance,
-            "sample": new.sample,
-        }
-
-    kept = kept_or_made(path, "feature statistics", make)
-    return FeatureStatistics(int(kept["count"]), kept["mean"], kept["covariance"], kept["sample"])
-
-
-def _made(features: FeatureNetwork, batches: Iterable[Any], field: str) -> FeatureStatistics:
     count, held, sample = 0, 0, []
     total = torch.zeros(features.width, dtype=torch.float64)
-    squares = torch.zeros(features.width, features.width, dtype=torch.float64)
-    for pictures in _pictures(batches, field):
-        vectors = features(pictures).cpu()
+    squares = torch.outer(total, total)
+    for batch in batches:
+        pictures = batch if isinstance(batch, Tensor) else read_field(batch, field, "batch")
+        vectors = features(pictures, cache).cpu()
         one, two = sums(vectors)
         total, squares, count = total + one, squares + two, count + len(vectors)
         sample.append(vectors[: MOST_KEPT - held])
@@ -119,20 +95,3 @@ def _made(features: FeatureNetwork, batches: Iterable[Any], field: str) -> Featu
     if count == 0:
         raise ValueError("there is no real picture to compare with")
     return FeatureStatistics.of_sums(count, total, squares, torch.cat(sample))
-
-
-def _fingerprint(features: FeatureNetwork, batches: Iterable[Any], field: str) -> str:
-    digest = hashlib.blake2b(f"{_EDITION} {features.identity} {MOST_KEPT}".encode(), digest_size=10)
-    for pictures in _pictures(batches, field):
-        for picture in eight_bit(pictures):  # one by one: batches of another size hold the same pictures
-            digest.update(content_of(picture).encode())
-    return digest.hexdigest()
-
-
-def _pictures(batches: Iterable[Any], field: str) -> Iterator[Tensor]:
-    for batch in batches:
-        yield batch if isinstance(batch, Tensor) else read_field(batch, field, "batch")
-
-
-def _kind(value: Any) -> str:
-    return type(value).__name__

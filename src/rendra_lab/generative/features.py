@@ -13,13 +13,14 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab import report
+from rendra_lab.data.kept_tensors import kept_or_made
 from rendra_lab.networks.efficientnet_lite import EfficientNetLite0, has_weights, weights_file
 from rendra_lab.networks.inception_v3 import InceptionV3
 from rendra_lab.random_state import untouched
@@ -27,6 +28,7 @@ from rendra_lab.settings import Range
 
 _MOST_PIXELS = 32 * 128 * 128  # that a network is shown at once
 _KNOWN_BYTES = 64 << 20
+_LITE0_LEVELS = {112: 4, 320: 5}  # how many of its levels there are up to one of so many numbers
 _known: OrderedDict[tuple[str, str], Tensor] = OrderedDict()
 
 
@@ -46,8 +48,13 @@ class FeatureNetwork(ABC):
     def __init__(self, side: int) -> None:
         self.side = side
 
-    def __call__(self, pictures: Tensor) -> Tensor:
+    def __call__(self, pictures: Tensor, cache: Path | None = None) -> Tensor:
         """Vectors (B, `width`), float32, of pictures (B, 3, H, W); values outside of [0, 1] are cut.
+
+        Args:
+            pictures: sRGB.
+            cache: folder in which the vectors are kept for later runs, by the content of these pictures; None keeps
+                them in memory alone.
 
         Raises:
             ValueError: they are no such pictures.
@@ -57,13 +64,13 @@ class FeatureNetwork(ABC):
         if key in _known:
             _known.move_to_end(key)
         else:
-            _remember(key, self._seen(steps))
+            _remember(key, self._seen(steps) if cache is None else self._kept(steps, key, cache))
         return _known[key].to(pictures.device)
 
     @property
     def identity(self) -> str:
         """Everything that a vector depends on besides its picture, in words."""
-        return f"{self.name} of {self._weights()} at {self.side}"
+        return f"{self.width} numbers of {self.name} of {self._weights()} at {self.side}"
 
     @abstractmethod
     def _network(self, device: torch.device) -> nn.Module:
@@ -77,6 +84,11 @@ class FeatureNetwork(ABC):
     def _weights(self) -> str:
         """What tells the network's weights from others."""
 
+    def _kept(self, steps: Tensor, key: tuple[str, str], cache: Path) -> Tensor:
+        folder = cache / f"features_{self.name}_{hashlib.blake2b(key[0].encode(), digest_size=6).hexdigest()}"
+        path = folder / f"{key[1]}.safetensors"
+        return kept_or_made(path, "features of pictures", lambda: {"vectors": self._seen(steps).cpu()})["vectors"]
+
     def _seen(self, steps: Tensor) -> Tensor:
         network, few = self._network(steps.device), max(_MOST_PIXELS // self.side**2, 1)
         with torch.no_grad(), torch.autocast(steps.device.type, enabled=False):
@@ -85,14 +97,16 @@ class FeatureNetwork(ABC):
 
 
 class Lite0Features(FeatureNetwork):
-    """EfficientNet-Lite0 of ImageNet behind its last block, averaged over the places: 320 numbers.
+    """EfficientNet-Lite0 of ImageNet, a layer of it, averaged over the places. Scores: fd_lite0, kid_lite0; no FID.
 
-    The 1,280 of its head would ask for more pictures than are made for a score in the middle of a fit: a covariance
-    needs more pictures than numbers. The network was trained at 224 pixels; at 128 it takes a third of the time, and
-    small pictures are enlarged less. Scores are called fd_lite0 and kid_lite0; they are no FID, and at another side
-    they are other numbers.
+    A covariance needs many more pictures than numbers: of 250 real pictures and 250 others of the same kind, 64 x 64
+    pixels, the 320 numbers behind the last block say a distance of 196, a tenth of that from grey noise; the 112
+    behind the last block of stride 16 say 26, a fortieth. Those are the default, as some thousand pictures are what
+    a score in the middle of a fit can afford. The network was trained at 224 pixels; at 128 it takes a third of the
+    time, and small pictures are enlarged less. Another layer or side makes other numbers.
 
     Args:
+        width: 112 or 320 numbers of a vector, which says the layer.
         side: pixels to which pictures are resized.
 
     Raises:
@@ -100,10 +114,12 @@ class Lite0Features(FeatureNetwork):
     """
 
     name = "lite0"
-    width = 320
 
-    def __init__(self, side: Annotated[int, Range(32)] = 128) -> None:
+    def __init__(self, width: Literal[112, 320] = 112, side: Annotated[int, Range(32)] = 128) -> None:
         super().__init__(side)
+        if width not in _LITE0_LEVELS:
+            raise ValueError(f"EfficientNet-Lite0 has layers of {list(_LITE0_LEVELS)} numbers, got {width}")
+        self.width = width
         weights_file()
 
     def _network(self, device: torch.device) -> nn.Module:
@@ -111,7 +127,8 @@ class Lite0Features(FeatureNetwork):
 
     def _vectors(self, network: nn.Module, pictures: Tensor) -> Tensor:
         assert isinstance(network, EfficientNetLite0)
-        return network.levels(pictures.contiguous(memory_format=torch.channels_last))[-1].mean((2, 3))
+        pictures = pictures.contiguous(memory_format=torch.channels_last)
+        return network.levels(pictures, _LITE0_LEVELS[self.width])[-1].mean((2, 3))
 
     def _weights(self) -> str:
         return _file_content(weights_file())

@@ -28,7 +28,8 @@ class PictureSetDistance(Metric, ABC):
 
     Args:
         features: the network that sees the pictures.
-        cache: folder in which the statistics of reference pictures are kept; None makes them in every run.
+        cache: folder in which what the network sees in real pictures is kept by content, for later runs; None sees
+            them anew in every run.
     """
 
     full_state_update = False
@@ -99,7 +100,7 @@ class PictureSetDistance(Metric, ABC):
         return 2
 
     def _take(self, who: Who, pictures: Tensor) -> None:
-        vectors = self.features(pictures).to(self.device)
+        vectors = self.features(pictures, self.cache if who == "real" else None).to(self.device)
         setattr(self, f"{who}_count", getattr(self, f"{who}_count") + len(vectors))
         self._add(who, vectors)
 

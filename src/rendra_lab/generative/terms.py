@@ -28,7 +28,7 @@ def generative_term(
     Args:
         distance: frechet or kernel.
         features: the network that sees the pictures; None switches the term off.
-        cache: folder of statistics of reference pictures.
+        cache: folder in which what the network sees in real pictures is kept for later runs.
         prediction: the field of made pictures (B, 3, H, W).
         target: the batch's field of real ones; null where all come with `PictureSetDistance.reference`.
     """

@@ -61,13 +61,14 @@ def test_distances_grow_with_noise_blur_and_dropped_modes(kind: type[FrechetDist
 
 
 @installed
-def test_the_network_is_the_one_of_imagenet_behind_its_last_block() -> None:
+def test_the_network_is_the_one_of_imagenet_behind_a_block() -> None:
     pictures = torch.rand(2, 3, 64, 64).mul(255).round().div(255)
-    seen = Lite0Features(side=64)(pictures)
     with torch.no_grad():
-        expected = EfficientNetLite0.pretrained().levels(pictures)[-1].mean((2, 3))
-    assert seen.shape == (2, 320)
-    assert_close(seen, expected, atol=1e-4)
+        levels = EfficientNetLite0.pretrained().levels(pictures)
+    for width, level in ((112, levels[3]), (320, levels[4])):
+        seen = Lite0Features(width, side=64)(pictures)
+        assert seen.shape == (2, width)
+        assert_close(seen, level.mean((2, 3)), atol=1e-4)
 
 
 @installed
@@ -82,7 +83,8 @@ def test_a_folded_network_is_the_same_network() -> None:
 @installed
 def test_both_scores_of_one_evaluation_share_their_network() -> None:
     assert lite0_if_installed() is lite0_if_installed()
-    assert Lite0Features(64).identity != Lite0Features(96).identity
+    variants = [Lite0Features(), Lite0Features(side=64), Lite0Features(320)]
+    assert len({each.identity for each in variants}) == 3
 
 
 def test_without_the_weights_the_extra_is_named(
