@@ -67,9 +67,9 @@ class Framing:
     def framed(self, picture: Image.Image) -> Tensor:
         """Colours (3, S, S), uint8."""
         across = min(*picture.size, self.crop or max(picture.size))
-        left, top = ((length - across) * self._part() for length in picture.size)
-        part = (left, top, left + across, top + across)
-        small = self._opaque(picture).resize((self.side, self.side), Image.Resampling.BICUBIC, box=part)
+        left, top = (round((length - across) * self._part()) for length in picture.size)
+        square = self._opaque(picture.crop((left, top, left + across, top + across)))
+        small = square.resize((self.side, self.side), Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous()
 
     def _part(self) -> float:
