@@ -38,7 +38,7 @@ def follow(average: nn.Module, network: nn.Module, decay: float) -> None:
     ours, theirs = dict(average.named_parameters()), dict(network.named_parameters())
     if ours.keys() != theirs.keys():
         raise ValueError(f"only one of average and network has the weights {', '.join(sorted(ours.keys() ^ theirs))}")
-    if ours:
-        torch._foreach_lerp_(list(ours.values()), [theirs[name].detach() for name in ours], 1 - decay)
+    for name, weight in ours.items():
+        weight.lerp_(theirs[name], 1 - decay)
     for mine, other in zip(average.buffers(), network.buffers(), strict=True):
         mine.copy_(other)

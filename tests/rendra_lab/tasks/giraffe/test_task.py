@@ -8,7 +8,8 @@ from typing import Any
 import lightning.pytorch as pl
 import pytest
 import torch
-from torch import Tensor
+from far_device import Far, far  # noqa: F401
+from torch import Tensor, nn
 
 from rendra_lab.data.repeated import Repeated
 from rendra_lab.random_state import stream
@@ -175,3 +176,22 @@ def test_shares_in_colours() -> None:
     torch.testing.assert_close(corners[1, 0], torch.full((3,), 0.25))
     assert not corners[1, 1].any()
     assert not torch.equal(corners[0, 0], corners[0, 1])
+
+
+def test_a_step_stays_where_its_batch_lies(far: Any) -> None:  # noqa: F811
+    task = giraffe()
+    for module in task.modules():
+        for name, weight in module._parameters.items():
+            if weight is not None:
+                module._parameters[name] = nn.Parameter(weight.detach().to(far), weight.requires_grad)
+    batch = pictures().to(far)
+    prediction = task.predict(batch)
+    for total, *_ in (
+        task._generator_objective(prediction, batch, 0),
+        task._adversary_objective(prediction, batch, 0),
+    ):
+        assert isinstance(total, Far)
+        total.backward()
+    assert all(isinstance(each.grad, Far) for network in task._networks() for each in network)
+    task.follow()
+    assert all(image.shape[-1] == 3 for image in task.show(batch).values())
