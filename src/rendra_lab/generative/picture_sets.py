@@ -111,3 +111,28 @@ class PictureSetDistance(Metric, ABC):
                 "%s of %d pictures means little: its %d features need at least %d, better ten times as many",
                 self.name, count, self.features.width, self._least(),
             )  # fmt: skip
+
+
+class CountedPictures(Metric):
+    """How many pictures of either kind stand behind the scores of an evaluation: the smaller count of the two.
+
+    Distances of sets shrink as the sets grow: their values mean something only beside this number.
+    """
+
+    full_state_update = False
+    made: Tensor
+    real: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        for who in ("made", "real"):
+            self.add_state(who, torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+
+    def update(self, made: Tensor, real: Tensor) -> None:
+        """Adds the pictures of a batch, (B, ...) each."""
+        self.made = self.made + len(made)
+        self.real = self.real + len(real)
+
+    def compute(self) -> Tensor:
+        """The smaller count, a scalar."""
+        return torch.minimum(self.made, self.real).float()

@@ -13,6 +13,7 @@ from rendra_lab.generative import feature_statistics, features
 from rendra_lab.generative.feature_statistics import FeatureStatistics, reference_statistics
 from rendra_lab.generative.frechet import FrechetDistance, distance_of_statistics
 from rendra_lab.generative.kernel_distance import KernelDistance, kernel_distance
+from rendra_lab.generative.picture_sets import CountedPictures
 from rendra_lab.generative.terms import generative_term
 from rendra_lab.targets import check_targets
 
@@ -160,5 +161,13 @@ def test_terms_are_left_out_without_a_network() -> None:
 def test_what_is_configured_may_be_called(name: str) -> None:
     terms = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     check_targets(terms)
-    for key, term in terms.items():
-        assert term["distance"] == ("kernel" if key.startswith("kid") else "frechet")
+    for key in set(terms) - {"scored_pictures"}:
+        assert terms[key]["distance"] == ("kernel" if key.startswith("kid") else "frechet")
+
+
+def test_pictures_are_counted_beside_their_scores() -> None:
+    metric, other = CountedPictures(), CountedPictures()
+    metric.update(tiny(9, 1), tiny(4, 1))
+    other.update(tiny(5, 1), tiny(4, 1))
+    metric.merge_state(other)
+    assert float(metric.compute()) == 8
