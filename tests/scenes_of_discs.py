@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,13 +24,20 @@ class Discs:
         faults: what it does wrong: `glow` (the background brightens as the first object turns), `stuck` (objects are
             seen in the middle, wherever they are), `blind` (objects are not seen).
         objects: N.
-        ranges: of samplers, by their arguments' names.
+        turns, reach: of the boxes, whose middles lie within -reach and reach.
+        device: of the scenes.
     """
 
     def __init__(
-        self, *faults: str, objects: int = 1, turns: Sequence[float] = (0.0, 1.0), reach: float = 0.2
+        self,
+        *faults: str,
+        objects: int = 1,
+        turns: Sequence[float] = (0.0, 1.0),
+        reach: float = 0.2,
+        device: Any = "cpu",
     ) -> None:
         self.faults = faults
+        self.device = device
         self.boxes = BoxSampler(
             objects=objects,
             scale=((0.15, 0.15, 0.15), (0.2, 0.2, 0.2)),
@@ -42,7 +50,8 @@ class Discs:
         objects = self.boxes.objects
         shapes = (count, objects, CODE), (count, objects, CODE), (count, CODE), (count, CODE)
         codes = Codes(*(temperature * torch.randn(shape, generator=generator) for shape in shapes))
-        return Scenes(codes, self.boxes.sample(count, generator), self.cameras.sample(count, generator))
+        boxes, cameras = self.boxes.sample(count, generator), self.cameras.sample(count, generator)
+        return Scenes(codes, boxes, cameras).to(self.device)
 
     def __call__(self, scenes: Scenes) -> MadePictures:
         cover = self._cover(scenes)
@@ -69,12 +78,12 @@ class Discs:
         pose, boxes = scenes.cameras.camera_to_world, scenes.boxes
         seen = (boxes.translation - pose[:, None, :3, 3]) @ pose[:, :3, :3]
         half = -seen[..., 2:] * math.tan(math.radians(10.0))
-        middle = seen[..., :2] / half * torch.tensor([1.0, -1.0])
+        middle = seen[..., :2] / half * half.new_tensor([1.0, -1.0])
         if "stuck" in self.faults:
             middle = torch.zeros_like(middle)
         flat = 1 + 0.3 * torch.tanh(scenes.codes.shape[..., 0])
         radius = boxes.scale[..., 0] / half[..., 0]
-        ticks = (2 * torch.arange(SIDE) + 1) / SIDE - 1
+        ticks = (2 * torch.arange(SIDE, device=half.device) + 1) / SIDE - 1
         across = (ticks - middle[..., 0, None])[..., None, :] / radius[..., None, None]
         down = (ticks - middle[..., 1, None])[..., None] / (radius / flat)[..., None, None]
         exists = boxes.exists & ("blind" not in self.faults)

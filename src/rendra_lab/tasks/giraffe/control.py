@@ -120,7 +120,7 @@ def _layers(maker: SceneMaker, frames: Sequence[Scenes], index: int, threshold: 
 
 def _with_layers(rgb: UInt8[Tensor, "K 3 S S"], layers: Layers, scene: int) -> Picture:
     """The strip of a scene above those of its layers."""
-    rows = {"": [_picture(each) for each in rgb]}
+    rows = {"pictures": [_picture(each) for each in rgb]}
     for name, title in (
         ("objects", "share of each object"),
         ("mask", "what the object changes"),
@@ -133,7 +133,7 @@ def _with_layers(rgb: UInt8[Tensor, "K 3 S S"], layers: Layers, scene: int) -> P
         visualization.tile([visualization.resize(picture, height) for picture in pictures], STRIP)
         for pictures in rows.values()
     ]
-    named = [visualization.caption(line, title) if title else line for title, line in zip(rows, lines, strict=True)]
+    named = [visualization.caption(line, title) for title, line in zip(rows, lines, strict=True)]
     return visualization.tile(named, columns=1)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+from far_device import far  # noqa: F401
 from PIL import Image
 from scenes_of_discs import Discs
 
@@ -39,3 +41,11 @@ def test_programs_have_names() -> None:
     assert programs_named("add_objects") == ["add_objects"]
     with pytest.raises(UserError, match=r"program must be all or one of rotation_object, .*; got dance"):
         programs_named("dance")
+
+
+@pytest.mark.parametrize("program", list(PROGRAMS))
+def test_programs_stay_on_the_device_of_the_scenes(program: str, far: Any, tmp_path: Path) -> None:  # noqa: F811
+    play(Discs(objects=2, device=far), program, ORDER, tmp_path / "there")
+    play(Discs(objects=2), program, ORDER, tmp_path / "here")
+    there, here = (Image.open(tmp_path / place / f"{program}.png") for place in ("there", "here"))
+    assert there.tobytes() == here.tobytes()

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from assertions import assert_close
+from far_device import far  # noqa: F401
 from lightning.pytorch import LightningModule, Trainer
 from PIL import Image
 from scenes_of_discs import Discs
@@ -84,6 +85,11 @@ def test_the_same_seed_gives_the_same_numbers_whatever_the_batch() -> None:
     assert torch.equal(torch.get_rng_state(), before)
     with pytest.raises(UserError, match="object must be below 1"):
         measure(Discs(), Probe(scenes=1, object=1))
+
+
+def test_scores_stay_on_the_device_of_the_scenes(far: Any) -> None:  # noqa: F811
+    probe = Probe(scenes=2, turns=2)
+    assert measure(Discs(device=far), probe).rows == measure(Discs(), probe).rows
 
 
 def test_masks_and_their_places() -> None:
