@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from rendra_lab.records import TensorRecord
 from rendra_lab.synthesis.surface_pictures import GAMMA
 
-EDITION = 1  # of the places
+EDITION = 2  # of the places
 
 _TILE, _TILES = 256, 8  # cells along a side of a tile of noise, and how many there are
 _FINE_UNTIL = 8.0  # away: from there on less than half of the grain is seen
@@ -120,7 +120,7 @@ def sights(backdrop: Backdrop, eye: Float[Tensor, " 3"], rays: Float[Tensor, "R 
     at_wall = eye + to_wall.clamp_max(1e4)[:, None] * rays
     u, height = at_wall @ along, at_wall[:, 2] - floor
     on_wall = (to_wall < to_ground) & (height < _top(backdrop, u))
-    on_ground = ~on_wall & to_ground.isfinite()
+    on_ground = to_ground < to_wall  # a plain beyond the wall would stand above it: there the sky begins
     far = torch.where(on_wall, to_wall, to_ground).clamp_max(1e4)
     place = eye + far[:, None] * rays
     albedo = torch.zeros_like(rays)

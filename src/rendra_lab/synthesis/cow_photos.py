@@ -28,7 +28,7 @@ from rendra_lab.synthesis.cow_herd import BUILDS, COATS, Cow, PaintedCow, build_
 from rendra_lab.synthesis.object_pictures import ObjectPictures
 from rendra_lab.synthesis.surface_pictures import to_bytes, toned
 
-EDITION = 1  # of the pictures; another one makes all cached ones anew
+EDITION = 2  # of the pictures; another one makes all cached ones anew
 DISTANCE = 2.732  # of the camera, from the world's middle
 FOV_DEG = 20.0
 POLAR = (0.33, 0.45)  # v, least and most: the camera's polar angle is arccos(1 - 2 v)
@@ -38,7 +38,7 @@ SPREAD = 0.2  # x and y of the middle of that box, at most
 _HALF_WIDTH = math.tan(math.radians(FOV_DEG) / 2)  # of what is seen, at a distance of 1
 _SIDE = 2  # samples of a pixel along each of its sides
 _FACES_AT_64 = 3000  # of a cow in pictures of 64 x 64
-_MOST_FACES = 12_000
+_MOST_FACES = 9000
 _APART = 0.33  # of the colours of hair and of what is behind it, sRGB
 _TRIES = 12  # at most, of finding a place where a cow stands out
 _RNG = np.random.Generator

@@ -66,7 +66,7 @@ def test_above_a_low_wall_is_sky_that_glows_by_itself() -> None:
 
 def test_haze_takes_what_is_far_away() -> None:
     clear, hazy = (
-        sights(replace(place(), height=0.0, ragged=(0.0, 1.0), haze=haze), EYE, rays(), FLOOR) for haze in (1e9, 0.5)
+        sights(replace(place(), distance=99.0, turn=0.0, haze=haze), EYE, rays(), FLOOR) for haze in (1e9, 0.5)
     )
     far = clear.on_ground & (clear.place[:, 0] < -3)
     assert bool(far.any())
