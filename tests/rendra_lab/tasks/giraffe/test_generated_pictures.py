@@ -4,11 +4,14 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from rendra_lab.errors import UserError
+from rendra_lab.synthesis.clevr_like import camera_at
 from rendra_lab.synthesis.object_pictures import ObjectPictures
+from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler
 from rendra_lab.tasks.giraffe.generated_pictures import GeneratedPictures, KnownPictures, boxes_around, masks_of
 from rendra_lab.tasks.giraffe.picture_data import WithoutTruth, joined
 from rendra_lab.tasks.giraffe.records import PictureBatch
@@ -84,6 +87,13 @@ def test_a_cache_is_what_was_made_and_another_world_has_another(
         mended = data(Spots(), cache=tmp_path)
     assert "made anew" in caplog.text
     assert torch.equal(mended.splits.train[0].rgb, made.splits.train[0].rgb)
+
+
+@pytest.mark.parametrize("v", [0.1, 1 / 3, 0.5])
+def test_the_camera_of_solids_is_that_of_the_generator(v: float) -> None:
+    zero = torch.zeros(1)
+    theirs = CameraSampler().at(zero, torch.tensor([v]), torch.tensor([2.732]), zero).camera_to_world[0]
+    assert np.abs(camera_at(v) - theirs.double().numpy()).max() < 1e-6
 
 
 def test_boxes_hold_masks_and_nothing_more() -> None:
