@@ -6,6 +6,7 @@ the same input. Steps of tasks and whole commands are rendra's alone.
 
 from rendra_lab.benchmarks.bodies import BODIES
 from rendra_lab.benchmarks.geometry import GEOMETRY
+from rendra_lab.benchmarks.giraffe import GIRAFFE
 from rendra_lab.benchmarks.points import POINTS
 from rendra_lab.benchmarks.radiance import RADIANCE
 from rendra_lab.benchmarks.rays import RAYS
@@ -13,4 +14,4 @@ from rendra_lab.benchmarks.rendering import RENDERING
 from rendra_lab.benchmarks.splats import SPLATS
 from rendra_lab.benchmarks.volumes import VOLUMES
 
-BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *POINTS, *SPLATS, *VOLUMES, *BODIES)
+BENCHMARKS = (*RENDERING, *GEOMETRY, *RADIANCE, *RAYS, *POINTS, *SPLATS, *VOLUMES, *BODIES, *GIRAFFE)

@@ -11,20 +11,24 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Positive, Size
 
+_FEW, _MANY = 4096, 1 << 20  # points at a time, which fit into a core's cache, or keep a GPU busy
+
 
 class Stretches(NamedTuple):
     """Points of pieces of rays, each piece within one thing's space."""
 
     thing: Int[Tensor, " L"]  # whose codes
-    points: Float[Tensor, "L K 3"]
-    directions: Float[Tensor, "L 3"]  # of unit length
+    origins: Float[Tensor, "L 3"]
+    directions: Float[Tensor, "L 3"]  # of any length
+    depths: Float[Tensor, "L K"]  # points are origin + depth * direction
+    wanted: Bool[Tensor, "L K"]  # nobody looks at the others; the wanted ones of a stretch come first
 
 
 class FieldValues(NamedTuple):
@@ -87,31 +91,56 @@ class FeatureField(nn.Module):
         self.out = nn.Linear(hidden, features)
 
     def forward(self, at: Stretches, shape: Float[Tensor, "T Z"], appearance: Float[Tensor, "T Z"]) -> FieldValues:
-        """Densities before noise, and hidden features, at points of things with these codes."""
-        encoded = octaves(at.points / self.point_scale, self.point_octaves)
-        x = F.relu(self.from_points(encoded) + _each(self.from_shape(shape), at.thing))
+        """Densities before noise, and hidden features, at points of things with these codes.
+
+        What is not wanted is 0 or not, as is convenient. Without gradients points are looked at a few at a time, so
+        that near memory is enough, and hardly any but those that are wanted.
+        """
+        if torch.is_grad_enabled() or not at.depths.numel():
+            return self._at(at, shape, appearance)
+        counts = at.wanted.sum(1)
+        order = counts.argsort(descending=True)
+        density, hidden = at.depths.new_zeros(at.depths.shape), at.depths.new_zeros((*at.depths.shape, self.hidden))
+        points = _FEW if at.depths.device.type == "cpu" else _MANY
+        for rows in order.split(max(points // at.depths.shape[1], 1)):
+            most = int(counts[rows[0]])
+            if most == 0:
+                break
+            part = Stretches(*(each.index_select(0, rows) for each in at))
+            part = part._replace(depths=part.depths[:, :most], wanted=part.wanted[:, :most])
+            values = self._at(part, shape, appearance)
+            density[rows, :most], hidden[rows, :most] = values.density, values.hidden
+        return FieldValues(density, hidden)
+
+    def _at(self, at: Stretches, shape: Tensor, appearance: Tensor) -> FieldValues:
+        points = at.origins.T[:, :, None] + at.depths * at.directions.T[:, :, None]
+        encoded = octaves(points / self.point_scale, self.point_octaves).flatten(1).mT
+        rows, each = at.depths.shape, lambda values: values.index_select(0, at.thing)[:, None]
+        x = self.from_points(encoded).unflatten(0, rows) + each(self.from_shape(shape))
         skips = dict(zip(self.skips, zip(self.skips_from_points, self.skips_from_shape, strict=True), strict=True))
+        x = F.relu_(x).flatten(0, 1)
         for number, layer in enumerate(self.trunk, 1):
-            x = F.relu(layer(x))
+            x = F.relu_(layer(x))
             if number in skips:
                 of_points, of_shape = skips[number]
-                x = x + of_points(encoded) + _each(of_shape(shape), at.thing)
-        directions = at.directions / self.point_scale if self.views_downscaled else at.directions
-        seen = self.from_directions(octaves(directions, self.view_octaves))[:, None]
-        hidden = F.relu(self.to_view(x) + _each(self.from_appearance(appearance), at.thing) + seen)
-        return FieldValues(self.to_density(x).squeeze(-1), hidden)
+                x = (of_points(encoded).unflatten(0, rows) + each(of_shape(shape))).flatten(0, 1) + x
+        directions = F.normalize(at.directions.T, dim=0) / (self.point_scale if self.views_downscaled else 1.0)
+        of_ray = self.from_directions(octaves(directions, self.view_octaves).mT)[:, None]
+        hidden = F.relu_(self.to_view(x).unflatten(0, rows) + (each(self.from_appearance(appearance)) + of_ray))
+        return FieldValues(self.to_density(x).view(rows), hidden)
 
     def to_features(self, hidden: Float[Tensor, "L H"], weight: Float[Tensor, " L"]) -> Float[Tensor, "L C"]:
         """Features of sums of hidden ones: `weight` is the sum of their weights."""
         return F.linear(hidden, self.out.weight) + weight[:, None] * self.out.bias
 
 
-def octaves(x: Float[Tensor, "*any D"], count: int) -> Float[Tensor, "*any 2*D*count"]:
-    """Sines and cosines of 2^i pi x for i = 0 .. count - 1: all sines of an octave, then all cosines."""
-    waves = [(sign, 2.0**number * math.pi) for number in range(count) for sign in (torch.sin, torch.cos)]
-    return torch.cat([wave(factor * x) for wave, factor in waves], -1)
+def octaves(x: Float[Tensor, "D ..."], count: int) -> Float[Tensor, "E ..."]:
+    """Sines and cosines of 2^i pi x for i = 0 .. count - 1: all sines of an octave, then all cosines.
 
-
-def _each(values: Tensor, thing: Tensor) -> Tensor:
-    """Values (T, H) of stretches' things: (L, 1, H)."""
-    return values.index_select(0, thing)[:, None]
+    Angles are doubled, which costs a tenth of the sines; rounding doubles too, as that of 2^i x does.
+    """
+    waves = [(math.pi * x).sin(), (math.pi * x).cos()]
+    for _ in range(count - 1):
+        sin, cos = waves[-2:]
+        waves += [2 * sin * cos, (cos - sin) * (cos + sin)]
+    return torch.cat(waves)

@@ -6,6 +6,7 @@ Letters: B pictures, N objects of a scene, P = V V rays of a picture, L pieces o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +23,10 @@ from rendra_lab.tasks.giraffe.feature_fields import FeatureField, FieldValues, S
 from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
 from rendra_lab.tasks.giraffe.ray_sampling import OwnRays, Pieces, Samples, Sampling, into_boxes
 from rendra_lab.tasks.giraffe.records import Codes, MadePictures, Scenes
+
+_AT_ONCE = 16  # samples of the background, before somebody looks what is left to see
+_NOTHING = 1e-7  # light that is none beside all of it
+_FEW, _MANY = 1024, 1 << 16  # rays at a time: their features fit into a cache, or keep a GPU busy
 
 
 class CodeSizes(NamedTuple):
@@ -119,7 +124,8 @@ class Generator(nn.Module):
 
         Args:
             scenes: what to show.
-            noise: draws noise of densities and depths, as in training; None: neither.
+            noise: draws noise of densities and depths, as in training; None: neither. What is drawn for whom hangs on
+                whether gradients are wanted.
         """
         features, shares = self._look(scenes, noise)
         return MadePictures(self.renderer(features), shares)
@@ -128,7 +134,7 @@ class Generator(nn.Module):
         """What the neural renderer is given."""
         return self._look(scenes, None)[0]
 
-    def alpha_maps(self, scenes: Scenes) -> Float[Tensor, "B N+1 V V"]:
+    def alpha_maps(self, scenes: Scenes) -> Float[Tensor, "B T V V"]:
         """Opacity of each object, and last of the background, as if it were alone in the world."""
         rays, own = self._rays(scenes)
         samples = self.sampling.samples(rays, own, scenes.boxes.exists, None)
@@ -140,17 +146,30 @@ class Generator(nn.Module):
         )
 
     def _look(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """The feature image and the shares of things in it."""
+        """The feature image, and the shares of things in it; without gradients a few pictures at a time."""
+        if torch.is_grad_enabled() or scenes.batch_size < 2:
+            return self._look_at_once(scenes, noise)
+        at_once = (_FEW if scenes.codes.shape.device.type == "cpu" else _MANY) // self.feature_side**2
+        parts = [self._look_at_once(part, noise) for part in _split(scenes, max(at_once, 1))]
+        features, shares = zip(*parts, strict=True)
+        return torch.cat(features), torch.cat(shares)
+
+    def _look_at_once(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
         rays, own = self._rays(scenes)
         samples = self.sampling.samples(rays, own, scenes.boxes.exists, noise)
         objects = self._objects(scenes, own, samples.objects, noise)
-        background = self._background(scenes, rays, samples.background, noise)
-        of_objects, of_background = self.sampling.weights(samples, objects.density, background.density)
-        features, far_share = _summed(self.background_field, background, of_background)
-        near_features, near_share = _summed(self.object_field, objects, of_objects)
-        features = features.index_add(0, samples.objects.ray, near_features)
-        image = features.view(scenes.batch_size, self.feature_side, self.feature_side, -1).permute(0, 3, 1, 2)
-        return image.contiguous(), self._maps(samples, near_share, far_share, scenes)
+        if torch.is_grad_enabled():
+            background = self._background(scenes, rays, samples.background, noise)
+            of_objects, of_background = self.sampling.weights(samples, objects.density, background.density)
+            far = _summed(background.hidden, of_background)
+        else:
+            of_objects, far = self._in_steps(scenes, rays, samples, objects.density, noise)
+        near = _summed(objects.hidden, of_objects)
+        features = self.background_field.to_features(*far)
+        features = features.index_add(0, samples.objects.ray, self.object_field.to_features(*near))
+        shape = scenes.batch_size, self.feature_side, self.feature_side, features.shape[1]
+        image = features.view(shape).permute(0, 3, 1, 2).contiguous()
+        return image, self._maps(samples, near[1], far[1], scenes)
 
     def _rays(self, scenes: Scenes) -> tuple[Rays, OwnRays]:
         self._check(scenes)
@@ -173,6 +192,27 @@ class Generator(nn.Module):
         codes = scenes.codes.background_shape, scenes.codes.background_appearance
         return self._evaluated(self.background_field, at, (origins, directions), codes, noise)
 
+    def _in_steps(
+        self, scenes: Scenes, rays: Rays, samples: Samples, objects: Tensor, noise: torch.Generator | None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """The background from near to far, as long as something is left to see of it.
+
+        Returns:
+            the weights of the objects' samples, and the background's sums as of `_summed`.
+        """
+        far = samples.background
+        density, sums = torch.zeros_like(far.depths), []
+        for first in range(0, far.depths.shape[1], _AT_ONCE):
+            these = slice(first, first + _AT_ONCE)
+            left = self.sampling.clear(samples, objects, density)[:, these] > _NOTHING
+            piece = Pieces(far.ray, far.thing, far.depths[:, these], far.lengths[:, these], left, far.slot[:, these])
+            background = self._background(scenes, rays, piece, noise)
+            density[:, these] = background.density
+            weights = self.sampling.weights(samples, objects, density)
+            sums.append(_summed(background.hidden, weights[1][:, these]))
+        hidden, shares = (torch.stack(each).sum(0) for each in zip(*sums, strict=True))
+        return weights[0], (hidden, shares)
+
     def _evaluated(
         self,
         field: FeatureField,
@@ -181,9 +221,7 @@ class Generator(nn.Module):
         codes: tuple[Tensor, Tensor],
         noise: torch.Generator | None,
     ) -> FieldValues:
-        origins, directions = rays
-        points = origins[:, None] + at.depths[..., None] * directions[:, None]
-        raw, hidden = field(Stretches(at.thing, points, F.normalize(directions, dim=-1)), *codes)
+        raw, hidden = field(Stretches(at.thing, *rays, at.depths, at.inside), *codes)
         if noise is not None and self.density_noise > 0:
             drawn = torch.randn(raw.shape, generator=noise, device=noise.device)
             raw = raw + self.density_noise * drawn.to(raw)
@@ -195,8 +233,8 @@ class Generator(nn.Module):
         pixels = side * side
         flat = samples.objects.thing * pixels + samples.objects.ray % pixels
         of_objects = objects.new_zeros(things * pixels).index_add(0, flat, objects)
-        shape = scenes.batch_size, -1, side, side
-        return torch.cat([of_objects.view(shape), background.view(shape)], 1)
+        batch, number = scenes.boxes.exists.shape
+        return torch.cat([of_objects.view(batch, number, side, side), background.view(batch, 1, side, side)], 1)
 
     def _check(self, scenes: Scenes) -> None:
         codes, (Z, Zb) = scenes.codes, self.code_sizes
@@ -207,8 +245,16 @@ class Generator(nn.Module):
             )
 
 
-def _summed(field: FeatureField, values: FieldValues, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Features (L, C) of pieces, their samples weighted, and the weights' sums (L,)."""
-    share = weights.sum(1)
-    hidden = torch.einsum("lkh,lk->lh", values.hidden, weights)
-    return field.to_features(hidden, share), share
+def _split(scenes: Scenes, size: int) -> Iterator[Scenes]:
+    """So many scenes at a time."""
+    for first in range(0, scenes.batch_size, size):
+        rows = slice(first, first + size)
+        yield Scenes(*(
+            replace(record, **{name: getattr(record, name)[rows] for name in record.names()})
+            for record in (scenes.codes, scenes.boxes, scenes.cameras)
+        ))  # fmt: skip
+
+
+def _summed(hidden: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Hidden features (L, H) of pieces, their samples weighted, and the weights' sums (L,)."""
+    return torch.einsum("lkh,lk->lh", hidden, weights), weights.sum(1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -18,10 +19,10 @@ from torch.nn import functional as F
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Amount, Positive, Size
 from rendra_lab.tasks.giraffe.camera_sampler import Rays
+from rendra_lab.tasks.giraffe.composition import clear, per_density, seen, walled
 from rendra_lab.tasks.giraffe.records import Boxes
 
-_WALL = 100.0  # optical thickness of what nothing passes: exp(-100) is 0 in float32
-_TINY = 1e-20  # below every density that counts, and every direction's part along an axis
+_TINY = 1e-20  # part of a direction along an axis that counts as none
 
 
 class OwnRays(NamedTuple):
@@ -40,7 +41,7 @@ class Pieces(NamedTuple):
     thing: Int[Tensor, " L"]  # b N + n; of the background b
     depths: Float[Tensor, "L K"]
     lengths: Float[Tensor, "L K"]  # of the world that each sample stands for
-    inside: Bool[Tensor, "L K"]  # whether it is in the thing's box
+    inside: Bool[Tensor, "L K"]  # whether it is in the thing's box; those that are come first
     slot: Int[Tensor, "L K"]  # which of its ray's samples: things at one depth may share one
 
 
@@ -70,6 +71,10 @@ class Sampling(ABC):
             exists: bool (B, N); nothing looks into a box that does not.
             noise: where to draw from.
         """
+
+    @abstractmethod
+    def clear(self, samples: Samples, objects: Tensor, background: Tensor) -> Tensor:
+        """How much passes what is in front of each sample (R, Kb) of the background; arguments as of `weights`."""
 
     @abstractmethod
     def weights(self, samples: Samples, objects: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,23 +142,32 @@ class DenseSampling(Sampling):
 
     def weights(self, samples: Samples, objects: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
         """See Sampling: a sample's weight is divided among the things there as their densities are."""
-        flat = (samples.objects.ray[:, None] * self.count + samples.objects.slot).flatten()
-        total = background.flatten().index_add(0, flat, objects.flatten()).view_as(background)
+        total = self._total(samples, objects, background)
         thickness = total * samples.background.lengths
+        weights = seen(thickness if self.last_length is not None else walled(thickness))
+        share = per_density(weights, total)
+        of_background = background * share
         if self.last_length is None:
-            thickness = _walled(thickness)
-        seen = _seen(thickness)
-        per_density = seen / total.clamp_min(_TINY)
-        of_background = background * per_density
-        if self.last_length is None:
-            per_density = F.pad(per_density[:, :-1], (0, 1))
-            of_background = torch.cat([of_background[:, :-1], seen[:, -1:]], 1)
-        return objects * per_density.flatten().index_select(0, flat).view_as(objects), of_background
+            share = F.pad(share[:, :-1], (0, 1))
+            of_background = torch.cat([of_background[:, :-1], weights[:, -1:]], 1)
+        return objects * share.flatten().index_select(0, self._flat(samples.objects)).view_as(objects), of_background
+
+    def clear(self, samples: Samples, objects: Tensor, background: Tensor) -> Tensor:
+        """See Sampling."""
+        return clear(self._total(samples, objects, background) * samples.background.lengths)
 
     def alone(self, pieces: Pieces, densities: Tensor) -> Tensor:
         """See Sampling; the last stratum has no length then, as in the published code."""
         last = pieces.slot == self.count - 1
         return -torch.expm1(-(densities * pieces.lengths).masked_fill(last, 0.0).sum(1))
+
+    def _total(self, samples: Samples, objects: Tensor, background: Tensor) -> Tensor:
+        """Densities (R, K) of all things together."""
+        total = background.flatten().index_add(0, self._flat(samples.objects), objects.flatten())
+        return total.view_as(background)
+
+    def _flat(self, pieces: Pieces) -> Tensor:
+        return (pieces.ray[:, None] * self.count + pieces.slot).flatten()
 
     def _depths(self, rays: int, like: Tensor, noise: torch.Generator | None) -> Tensor:
         depths = torch.linspace(self.near, self.far, self.count, device=like.device, dtype=like.dtype)
@@ -214,19 +228,28 @@ class BoxSampling(Sampling):
 
     def weights(self, samples: Samples, objects: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
         """See Sampling."""
+        return self._in_order(samples, objects, background, seen)
+
+    def clear(self, samples: Samples, objects: Tensor, background: Tensor) -> Tensor:
+        """See Sampling."""
+        return self._in_order(samples, objects, background, clear)[1]
+
+    def _in_order(
+        self, samples: Samples, objects: Tensor, background: Tensor, ask: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """What is said of the thickness of all samples of a ray (R, S), the nearest first: (L, K) and (R, Kb)."""
         near, far = samples.objects, samples.background
-        thickness = _walled(background * far.lengths)
-        slots = int(near.slot.max()) + 1 if near.slot.numel() else self.in_background
-        if slots == self.in_background:
-            return torch.zeros_like(objects), _seen(thickness)
-        flat = (near.ray[:, None] * slots + near.slot).flatten()
-        extra = slots - self.in_background
+        thickness = walled(background * far.lengths)
+        if not near.slot.numel():
+            return objects, ask(thickness)
+        slots = int(near.slot.max()) + 1
+        flat, extra = (near.ray[:, None] * slots + near.slot).flatten(), slots - self.in_background
         thickness = F.pad(thickness, (0, extra)).flatten().index_add(0, flat, (objects * near.lengths).flatten())
         depths = F.pad(far.depths, (0, extra), value=math.inf).flatten().index_copy(0, flat, near.depths.flatten())
         order = depths.view(-1, slots).sort(dim=1, stable=True).indices
-        seen = _seen(thickness.view(-1, slots).gather(1, order))
-        seen = torch.zeros_like(seen).scatter(1, order, seen)
-        return seen.flatten().index_select(0, flat).view_as(objects), seen[:, : self.in_background]
+        said = ask(thickness.view(-1, slots).gather(1, order))
+        said = torch.zeros_like(said).scatter(1, order, said)
+        return said.flatten().index_select(0, flat).view_as(objects), said[:, : self.in_background]
 
     def alone(self, pieces: Pieces, densities: Tensor) -> Tensor:
         """See Sampling."""
@@ -279,16 +302,6 @@ def _hits(own: OwnRays, exists: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]
     thing = flat // pixels
     ray = thing // objects * pixels + flat % pixels
     return thing, ray, own.enter.flatten().index_select(0, flat), own.leave.flatten().index_select(0, flat)
-
-
-def _seen(thickness: Tensor) -> Tensor:
-    """Weights (R, K) of samples in order: 1 - exp(-thickness), dimmed by all those before."""
-    before = F.pad(thickness.cumsum(1)[:, :-1], (1, 0))
-    return torch.exp(-before) * -torch.expm1(-thickness)
-
-
-def _walled(thickness: Tensor) -> Tensor:
-    return torch.cat([thickness[:, :-1], torch.full_like(thickness[:, -1:], _WALL)], 1)
 
 
 def _uniform(shape: tuple[int, ...], noise: torch.Generator, like: Tensor) -> Tensor:
