@@ -6,6 +6,7 @@ import pytest
 import torch
 from assertions import assert_close
 from few_numbers import Quarters, tiny
+from safetensors.torch import save_file
 from skimage import data
 from torch import Tensor
 from torch.nn import functional as F
@@ -23,6 +24,7 @@ from rendra_lab.generative.frechet import FrechetDistance
 from rendra_lab.generative.kernel_distance import KernelDistance
 from rendra_lab.networks import efficientnet_lite
 from rendra_lab.networks.efficientnet_lite import EfficientNetLite0
+from rendra_lab.networks.inception_v3 import InceptionV3
 
 installed = pytest.mark.skipif(not efficientnet_lite.has_weights(), reason="needs the extra [features]")
 
@@ -40,8 +42,8 @@ def crops(photo: Tensor, count: int, seed: int, side: int = 64) -> Tensor:
 def test_distances_grow_with_noise_blur_and_dropped_modes(kind: type[FrechetDistance] | type[KernelDistance]) -> None:
     photos = [torch.from_numpy(photo) for photo in (data.chelsea(), data.coffee(), data.astronaut())]
     network = Lite0Features(side=64)
-    real = torch.cat([crops(photo, 24, k) for k, photo in enumerate(photos)])
-    other = torch.cat([crops(photo, 24, 10 + k) for k, photo in enumerate(photos)])
+    real = torch.cat([crops(photo, 14, k) for k, photo in enumerate(photos)])
+    other = torch.cat([crops(photo, 14, 10 + k) for k, photo in enumerate(photos)])
 
     def distance(made: Tensor) -> float:
         metric = kind(network)
@@ -56,7 +58,7 @@ def test_distances_grow_with_noise_blur_and_dropped_modes(kind: type[FrechetDist
     assert alike < noisy[0] < noisy[1] < noisy[2]
     blurred = [distance(F.avg_pool2d(other, size, 1, size // 2)) for size in (3, 5, 9)]
     assert alike < blurred[0] < blurred[1] < blurred[2]
-    dropped = [distance(torch.cat([other[: 24 * kept]] * (6 // kept))) for kept in (3, 2, 1)]
+    dropped = [distance(torch.cat([other[: 14 * kept]] * (6 // kept))) for kept in (3, 2, 1)]
     assert dropped[0] < dropped[1] < dropped[2]
 
 
@@ -105,6 +107,18 @@ def test_without_the_weights_the_extra_is_named(
 def test_inception_without_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no file .*none\.pth.*pt_inception-2015-12-05"):
         InceptionFeatures(tmp_path / "none.pth")
+
+
+def test_fid_is_the_name_of_inception_alone(tmp_path: Path) -> None:
+    network = InceptionV3().eval()
+    save_file(network.state_dict(), tmp_path / "inception.safetensors")
+    metric = FrechetDistance(InceptionFeatures(tmp_path / "inception.safetensors"))
+    assert metric.name == "fid"
+    assert FrechetDistance(Quarters()).name == "fd_quarters"
+    pictures = eight_bit(torch.rand(1, 3, 64, 64))
+    with torch.no_grad():
+        large = F.interpolate(pictures / 255, (299, 299), mode="bilinear", align_corners=False)
+        assert_close(metric.features(pictures / 255), network(large), atol=1e-4)
 
 
 def test_pictures_are_seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
