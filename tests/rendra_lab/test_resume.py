@@ -81,6 +81,7 @@ VARIANTS = {
     ),
     "pose six_dof": ("task=pose", "pose=six_dof", *_SMALL_MESH),
     "pose levenberg_marquardt": ("task=pose", "solver=levenberg_marquardt", "compare_px=16", *_SMALL_MESH),
+    "giraffe in turn": ("task=giraffe", "module.in_turn=true", "adversary_loss.r1.every=3", *SMALLER["giraffe"]),
     "mesh_fit book": ("experiment=mesh_fit_all", "trainer.log_every_n_steps=1"),
 }
 _BARE = ("logger=csv", "trainer.log_every_n_steps=1")
