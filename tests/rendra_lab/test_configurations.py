@@ -57,6 +57,7 @@ _FEW_PICTURES = (
     "callbacks.animation=null",
     "callbacks.controls.scenes=2",
     "callbacks.controls.turns=2",
+    "+module.grid.samples=2",
 )
 _OF_TASKS = {
     "giraffe": _FEW_PICTURES,
@@ -80,6 +81,7 @@ _OF_SAMPLERS = {
     "stratified": ("sampler.samples=6",),
 }
 SMALLER = {
+    "giraffe_paper_256": (*_FEW_PICTURES, "callbacks.controls=null"),
     "mesh_rcnn_voxel_only": _FEW_ROOMS,
     "synsin_paper": (*_FEW_PAIRS, "network.depth.levels=6", "renderer.points_per_pixel=8"),
     "volume_book": (*_SMALL_SCENE, *_OF_VOLUMES["book"]),
