@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
+from rendra_lab.records import RecordT
 from rendra_lab.settings import Amount
 from rendra_lab.tasks.giraffe.box_sampler import BoxSampler, rotation_about_z
 from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler, Rays
@@ -249,10 +250,11 @@ def _split(scenes: Scenes, size: int) -> Iterator[Scenes]:
     """So many scenes at a time."""
     for first in range(0, scenes.batch_size, size):
         rows = slice(first, first + size)
-        yield Scenes(*(
-            replace(record, **{name: getattr(record, name)[rows] for name in record.names()})
-            for record in (scenes.codes, scenes.boxes, scenes.cameras)
-        ))  # fmt: skip
+        yield Scenes(_of(scenes.codes, rows), _of(scenes.boxes, rows), _of(scenes.cameras, rows))
+
+
+def _of(record: RecordT, rows: slice) -> RecordT:
+    return replace(record, **{name: getattr(record, name)[rows] for name in record.names()})
 
 
 def _summed(hidden: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

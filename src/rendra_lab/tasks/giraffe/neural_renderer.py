@@ -65,13 +65,14 @@ class NeuralRenderer(nn.Module):
         """Pictures (B, 3, S, S), in [0, 1] with the sigmoid, of features (B, C, V, V)."""
         x, rgb = features, self.to_rgb[0](features) if self.rgb_skips or not self.blocks else None
         for conv, to_rgb in zip(self.blocks, list(self.to_rgb)[1:], strict=True):
+            assert isinstance(conv, nn.Conv2d)
             x = F.leaky_relu(self._doubled(conv, x), _SLOPE)
             if rgb is not None:
                 rgb = self._larger(rgb) + to_rgb(x)
         rgb = self.to_rgb[-1](x) if rgb is None else rgb
         return rgb.sigmoid() if self.sigmoid else rgb
 
-    def _doubled(self, conv: nn.Module, x: Tensor) -> Tensor:
+    def _doubled(self, conv: nn.Conv2d, x: Tensor) -> Tensor:
         if self.feature_upsampling == "nearest":
             return doubled_and_convolved(x, conv.weight, conv.bias)
         return conv(F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False))
@@ -82,7 +83,7 @@ class NeuralRenderer(nn.Module):
         return blurred(F.interpolate(rgb, scale_factor=2, mode="bilinear", align_corners=False))
 
 
-def doubled_and_convolved(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def doubled_and_convolved(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """Pixels repeated along both axes, then a 3x3 convolution with zeros around: (B, D, 2H, 2W).
 
     Of the nine pixels that such a convolution reads at most four differ, so that one with a stride of 1/2 and 4x4
@@ -91,7 +92,7 @@ def doubled_and_convolved(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     Args:
         x: (B, C, H, W).
         weight: (D, C, 3, 3).
-        bias: (D,).
+        bias: (D,), or None.
     """
     sums = F.pad(weight, (1, 1, 1, 1))
     sums = sums[:, :, 1:] + sums[:, :, :-1]
