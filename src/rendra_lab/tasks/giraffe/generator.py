@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -16,14 +16,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
-from rendra_lab.records import RecordT
 from rendra_lab.settings import Amount
 from rendra_lab.tasks.giraffe.box_sampler import BoxSampler, rotation_about_z
 from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler, Rays
 from rendra_lab.tasks.giraffe.feature_fields import FeatureField, FieldValues, Stretches
 from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
 from rendra_lab.tasks.giraffe.ray_sampling import OwnRays, Pieces, Samples, Sampling, into_boxes
-from rendra_lab.tasks.giraffe.records import Codes, MadePictures, Scenes
+from rendra_lab.tasks.giraffe.records import Boxes, Cameras, Codes, MadePictures, Scenes
+
+_Part = TypeVar("_Part", Codes, Boxes, Cameras)
 
 _AT_ONCE = 16  # samples of the background, before somebody looks what is left to see
 _NOTHING = 1e-7  # light that is none beside all of it
@@ -253,7 +254,7 @@ def _split(scenes: Scenes, size: int) -> Iterator[Scenes]:
         yield Scenes(_of(scenes.codes, rows), _of(scenes.boxes, rows), _of(scenes.cameras, rows))
 
 
-def _of(record: RecordT, rows: slice) -> RecordT:
+def _of(record: _Part, rows: slice) -> _Part:
     return replace(record, **{name: getattr(record, name)[rows] for name in record.names()})
 
 
