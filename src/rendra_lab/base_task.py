@@ -119,6 +119,23 @@ class BaseTask(LightningModule, ABC, Generic[BatchT, PredictionT]):
                 module.training = training
 
 
+def with_rate(learned: Iterable[nn.Parameter], part: nn.Module, lr: float | None) -> list[Any]:
+    """Parameter groups in which a part has a learning rate of its own; without a rate the parameters as they are.
+
+    Args:
+        learned: all that is trained.
+        part: perhaps one that has learned elsewhere, and is to keep most of that.
+        lr: of the part; the rest has the optimizer's.
+    """
+    if lr is None:
+        return list(learned)
+    theirs = set(part.parameters())
+    groups: tuple[list[nn.Parameter], list[nn.Parameter]] = [], []
+    for each in learned:
+        groups[each in theirs].append(each)
+    return [{"params": groups[False]}, {"params": groups[True], "lr": lr}]
+
+
 class Task(BaseTask[BatchT, PredictionT]):
     """A task with one objective, the weighted sum of its losses, one optimizer and perhaps a scheduler.
 

@@ -12,7 +12,7 @@ from shapenet_files import shapenet_folder
 
 from rendra_lab.experiment import run
 
-_DETECTED = ("data.shortest_px=64", "data.longest_px=96", "data.batch_size=1")
+_DETECTED = ("data.shortest_px=64", "data.longest_px=96", "data.batch_size=1", "callbacks.detections.pictures=1")
 _SHAPED = ("data.points=50", "data.voxels=12")
 
 
@@ -21,7 +21,12 @@ _SHAPED = ("data.points=50", "data.voxels=12")
     [
         ("mesh_rcnn", "pix3d", pix3d_folder, (*_DETECTED, *_SHAPED)),
         ("mask_rcnn", "coco", coco_folder, (*_DETECTED, "network.classes=2")),
-        ("voxmesh", "shapenet", shapenet_folder, (*_SHAPED, "data.image_px=48", "data.batch_size=2")),
+        (
+            "voxmesh",
+            "shapenet",
+            shapenet_folder,
+            (*_SHAPED, "data.image_px=48", "data.batch_size=2", "callbacks.shapes.samples=500"),
+        ),
     ],
 )
 def test_folders_are_learned_from(

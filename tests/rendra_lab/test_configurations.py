@@ -37,7 +37,13 @@ _FEW_PAIRS = (
     "data.cache=null",
     "callbacks.pairs.pictures=1",
 )
-_FEW_ROOMS = ("data.counts=[2,1,1]", "data.batch_size=2", "data.cache=null", "callbacks.detections.pictures=1")
+_FEW_ROOMS = (
+    "data.counts=[2,1,1]",
+    "data.models_per_name=1",
+    "data.batch_size=2",
+    "data.cache=null",
+    "callbacks.detections.pictures=1",
+)
 _FEW_SHAPES = (
     "data.counts=[2,1,1]",
     "data.views=1",

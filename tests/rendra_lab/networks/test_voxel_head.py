@@ -90,3 +90,15 @@ def test_devices(far) -> None:  # noqa: F811
     assert isinstance(is_found, Far)
     assert isinstance(meshes.verts_packed(), Far)
     assert isinstance(central_tetrahedra(2, meshes.verts_packed()).verts_packed(), Far)
+
+
+def test_smoothing_evens_out_the_steps_and_keeps_the_size() -> None:
+    logits = torch.full((1, 12, 12, 12), -9.0)
+    places = torch.arange(12).float() - 5.5
+    inside = places.square()[:, None, None] + places.square()[:, None] + places.square() < 16
+    logits[0][inside] = 9.0
+    rough, smooth = cubified(logits)[0], cubified(logits, smoothing=10)[0]
+    assert torch.equal(rough.faces_packed(), smooth.faces_packed())
+    radii = [each.verts_packed().norm(dim=1) for each in (rough, smooth)]
+    assert float(radii[1].std()) < 0.6 * float(radii[0].std())
+    assert float(radii[1].mean()) == pytest.approx(float(radii[0].mean()), rel=0.05)

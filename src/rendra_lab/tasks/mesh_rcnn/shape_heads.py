@@ -18,7 +18,7 @@ from rendra_lab.detection.regions import Maps, ObjectRegions
 from rendra_lab.detection.roi_align import RoiAlign
 from rendra_lab.networks.mesh_refinement import MeshRefinement
 from rendra_lab.networks.voxel_head import VoxelHead, central_tetrahedra, cubified
-from rendra_lab.settings import Fraction, Positive
+from rendra_lab.settings import Count, Fraction, Positive
 from rendra_lab.tasks.mesh_rcnn.depth_head import DepthHead, extents_of
 from rendra_lab.tasks.mesh_rcnn.shape_targets import ShapeTargets, shape_targets, shapes_of
 
@@ -35,9 +35,13 @@ class ShapeHeads(nn.Module):
         voxels: tells voxels, of any class.
         meshes: refines meshes; None: the surface of the voxels is the answer ("voxel-only").
         threshold: probability above which a voxel is filled.
+        smoothing: of the voxels' surface, see `cubified`.
         points: of each true surface that a step learns from.
         most_regions: of a step that learn, drawn at random; None: all that hold objects.
+        warmup_steps: first steps, in which meshes do not learn yet: untrained voxels are no surface to refine.
     """
+
+    learned: Tensor  # steps so far; it is in checkpoints
 
     def __init__(
         self,
@@ -48,17 +52,21 @@ class ShapeHeads(nn.Module):
         mesh_pool: RoiAlign,
         meshes: MeshRefinement | None,
         threshold: Fraction = 0.2,
+        smoothing: Count = 0,
         points: Positive = 5000,
         most_regions: Positive | None = None,
+        warmup_steps: Count = 0,
     ) -> None:
         super().__init__()
         self.depth_pool, self.depth = depth_pool, depth
         self.voxel_pool, self.voxels = voxel_pool, voxels
         self.mesh_pool = mesh_pool
         self.meshes: MeshRefinement | None = meshes
-        self.threshold = threshold
+        self.threshold, self.smoothing = threshold, smoothing
         self.points = points
         self.most_regions = most_regions
+        self.warmup_steps = warmup_steps
+        self.register_buffer("learned", torch.zeros((), dtype=torch.int64))
 
     def learn(
         self, maps: Maps, regions: ObjectRegions, batch: PhotoBatch
@@ -77,7 +85,9 @@ class ShapeHeads(nn.Module):
             "voxels": CellVerdicts(logits, truth.voxels.to(logits)),
         }
         if self.meshes is not None:
-            said["meshes"] = self._learn_meshes(self.meshes, maps, regions, logits, truth)
+            is_early = int(self.learned) < self.warmup_steps
+            said["meshes"] = self._learn_meshes(self.meshes, maps, regions, logits, truth, is_early)
+        self.learned += 1
         return said
 
     def describe(self, maps: Maps, found: Detections) -> Detections:
@@ -85,7 +95,7 @@ class ShapeHeads(nn.Module):
         logits = self._voxels(maps, found.boxes, found.picture)
         meshes = Meshes([], []).to(found.boxes.device)
         if len(found.boxes):
-            meshes, _ = cubified(logits, self.threshold)
+            meshes, _ = cubified(logits, self.threshold, self.smoothing)
             if self.meshes is not None:
                 meshes = self.meshes(meshes, [self.mesh_pool(maps, found.boxes, found.picture)])[-1]
         extents = extents_of(self._depths(maps, found.boxes, found.picture, found.labels))
@@ -113,13 +123,21 @@ class ShapeHeads(nn.Module):
         return self.voxels(self.voxel_pool(maps, boxes, picture))
 
     def _learn_meshes(
-        self, refine: MeshRefinement, maps: Maps, regions: ObjectRegions, logits: Tensor, truth: ShapeTargets
+        self,
+        refine: MeshRefinement,
+        maps: Maps,
+        regions: ObjectRegions,
+        logits: Tensor,
+        truth: ShapeTargets,
+        is_early: bool,
     ) -> MeshVerdicts:
-        if not len(regions.boxes):  # something to refine all the same: the gradient of every weight is to be there
+        if is_early or not len(
+            regions.boxes
+        ):  # something to refine all the same: the gradient of every weight is to be there
             cells = maps[0].new_zeros(1, maps[0].shape[1], self.mesh_pool.side, self.mesh_pool.side)
             nothing = maps[0].new_zeros(1, 1, 3)
             is_valid = torch.zeros(1, dtype=torch.bool, device=cells.device)
             return MeshVerdicts(refine(central_tetrahedra(1, cells), [cells]), nothing, nothing, is_valid)
-        first, is_found = cubified(logits, self.threshold)
+        first, is_found = cubified(logits, self.threshold, self.smoothing)
         stages = refine(first, [self.mesh_pool(maps, regions.boxes, regions.picture)])
         return MeshVerdicts(stages, truth.points, truth.normals, is_found & truth.is_near)

@@ -63,7 +63,9 @@ class BodyProblem:
         rows, derivatives = [], []
         for term in self.task.terms():
             rows.append(term.residual_rows(prediction, self.people, self.step))
-            derivatives.append(term.row_derivatives(prediction, self.people, changes[str(term.prediction)], self.step))
+            derivatives.append(
+                term.row_derivatives(prediction, self.people, changes[str(term.prediction)], self.step)
+            )
         return torch.cat(rows, dim=1), torch.cat(derivatives, dim=1)
 
     def _changes(self, motion: Motion, x: Tensor) -> dict[str, Tensor]:

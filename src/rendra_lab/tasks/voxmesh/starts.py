@@ -50,20 +50,24 @@ class VoxelStart(MeshStart):
         threshold: the probability.
         warmup_steps: first steps of a fit, in which voxels are learned alone. An untrained head fills every voxel:
             so large a mesh would only cost time.
+        smoothing: of the surface, see `cubified`.
     """
 
-    def __init__(self, head: VoxelHead, threshold: Fraction = 0.2, warmup_steps: Count = 100) -> None:
+    def __init__(
+        self, head: VoxelHead, threshold: Fraction = 0.2, warmup_steps: Count = 100, smoothing: Count = 0
+    ) -> None:
         super().__init__()
         self.head = head
         self.threshold = threshold
         self.warmup_steps = warmup_steps
+        self.smoothing = smoothing
 
     def forward(self, maps: Sequence[Tensor], step: int) -> Start:
         """The cubified voxels; tetrahedra in the first steps of a fit."""
         logits = self.head(maps)
         if self.training and step < self.warmup_steps:
             return Start(central_tetrahedra(len(logits), like=logits), logits, is_real=False)
-        return Start(cubified(logits, self.threshold)[0], logits, is_real=True)
+        return Start(cubified(logits, self.threshold, self.smoothing)[0], logits, is_real=True)
 
 
 class SphereStart(MeshStart):

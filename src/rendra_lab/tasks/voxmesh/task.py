@@ -6,7 +6,7 @@ Shapes, axes and units: as of `ShapeBatch`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra.structures import Meshes
-from rendra_lab.base_task import Task
+from rendra_lab.base_task import Task, with_rate
 from rendra_lab.detection.drawing import draw_meshes, upright
 from rendra_lab.detection.records import CellVerdicts, MeshVerdicts
 from rendra_lab.frustums import Frustums
 from rendra_lab.mesh_scores import true_meshes
 from rendra_lab.networks.mesh_refinement import MeshRefinement
-from rendra_lab.settings import Positive
+from rendra_lab.settings import Positive, Size
 from rendra_lab.shape_records import ShapeBatch
 from rendra_lab.tasks.voxmesh.records import ShapePrediction
 from rendra_lab.tasks.voxmesh.starts import MeshStart, Start
@@ -38,6 +38,7 @@ class VoxMesh(Task[ShapeBatch, ShapePrediction]):
         start: what refinement begins with.
         refinement: reads all maps; None: the start is the answer.
         side_px: the shorter side that pictures are resized to; None keeps theirs.
+        backbone_lr: learning rate of the backbone, which may have learned elsewhere; None: the optimizer's.
         **parts: losses, metrics, optimizer, scheduler of `Task`.
     """
 
@@ -47,6 +48,7 @@ class VoxMesh(Task[ShapeBatch, ShapePrediction]):
         start: MeshStart,
         refinement: MeshRefinement | None,
         side_px: Positive | None = None,
+        backbone_lr: Size | None = None,
         **parts: Any,
     ) -> None:
         super().__init__(**parts)
@@ -54,6 +56,7 @@ class VoxMesh(Task[ShapeBatch, ShapePrediction]):
         self.start = start
         self.refinement = refinement
         self.side_px = side_px
+        self.backbone_lr = backbone_lr
 
     def predict(self, batch: ShapeBatch) -> ShapePrediction:
         """The meshes; in training also voxels and meshes of all stages beside the truth."""
@@ -82,6 +85,10 @@ class VoxMesh(Task[ShapeBatch, ShapePrediction]):
         truth = true_meshes(batch.shapes)
         named = {"mesh": prediction.meshes, "start": prediction.starts, "truth": truth}
         return {name: upright(each[0]) for name, each in named.items()}
+
+    def parameter_groups(self) -> Iterable[Any]:
+        """All that learns; the backbone apart if it has a rate of its own."""
+        return with_rate(super().parameter_groups(), self.backbone, self.backbone_lr)
 
     def _resized(self, pictures: Tensor) -> Tensor:
         shorter = min(pictures.shape[-2:])

@@ -50,9 +50,9 @@ def test_without_a_file_the_published_network_has_group_norm() -> None:
 
 def test_the_small_one_has_every_part() -> None:
     with torch.device("meta"):
-        detector, published = network("small"), network("paper")
-    assert sizes(detector) == 1_740_518
-    assert {type(part).__name__ for part in published.modules()} - {"_Bottleneck"} <= {
+        detector, published = network("small", "detector.backbone.weights=random"), network("paper")
+    assert sizes(detector) == 3_857_350
+    assert {type(part).__name__ for part in published.modules()} - {"_Bottleneck", "ResidualBackbone"} <= {
         type(part).__name__ for part in detector.modules()
     }
 
