@@ -49,6 +49,7 @@ _IDLE_WARNINGS = (
     r".*LeafSpec.*is deprecated.*",
     r"Using ModelCheckpoint with manual optimization.*",  # it warns of what we want: the state after the step
     r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint.*",
+    r"Found \d+ module\(s\) in eval mode.*",  # norms that keep what they learned elsewhere, and averages
 )
 
 # A trainer that writes nothing and starts no other processes.

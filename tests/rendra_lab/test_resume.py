@@ -35,6 +35,10 @@ _SCENE = (*_VIEWS, "data.rays_per_pixel_side=[[0,1],[6,2]]", "data.jitter=true",
 _OCCUPANCY = ("sampler.cells=8", "sampler.steps_across=8", "sampler.refresh_every=3", "sampler.empty_from=4")
 _HASHES = ("field.encoding.log2_table_size=8", "field.width=8")
 _VOLUME = ("volume.voxels=[6,8]", "module.refine_at=[4]", "+module.look_every=3", "+module.look_from=3")
+_ROOMS = (
+    *("data.counts=[4,1,1]", "data.models_per_name=1", "data.batch_size=2", "data.cache=null"),
+    "callbacks.detections.pictures=0",
+)
 _SMALL_MESH = ("mesh=torus", "scene.image_size=24")
 SMALLER = {
     "mesh_fit": (
@@ -49,7 +53,11 @@ SMALLER = {
         *("data.image_size=16", "network.discriminator.picture_side=16", "network.discriminator.widest=16"),
         *("network.generator.renderer.feature_side=4", "network.generator.renderer.picture_side=16"),
     ),
-    "mask_rcnn": ("data.counts=[4,1,1]", "data.batch_size=2", "callbacks.detections.pictures=0"),
+    "mask_rcnn": _ROOMS,
+    "mesh_rcnn": (
+        *(*_ROOMS, "data.points=100", "data.voxels=12", "network.detector.heads.shapes.warmup_steps=3"),
+        *("network.detector.heads.shapes.voxels.side=8", "network.detector.heads.shapes.voxel_pool.side=4"),
+    ),
     "nerf": (*_SCENE, *_OCCUPANCY, *_HASHES),
     "volume": (*_SCENE, *_VOLUME),
     "pose_track": ("data.frames=4", "data.steps_per_frame=3", *_SMALL_MESH),
