@@ -17,7 +17,7 @@ from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.synsin.hole_filling import filled
 
 _LEAST_COVER = 1e-3  # of a pixel: where there is less, the colour is nobody's
-_RETOUCHED = 0.1  # of what the decoder would change, where points cover a pixel; holes are its own
+_RETOUCHED = 0.05  # of what the decoder would change, where points cover a pixel; holes are its own
 _COVERED = 0.25  # what is covered by so much is no hole
 
 
