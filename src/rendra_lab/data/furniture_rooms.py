@@ -6,7 +6,6 @@ import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from rendra_lab.data.announced import announced
 from rendra_lab.data.epochs import Samples
-from rendra_lab.data.kept_tensors import Tensors, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
 from rendra_lab.data.photo_data import PhotoData, PhotoSplits, joined_shapes
 from rendra_lab.data.pix3d_writer import checked_folder, keys_of, write_pix3d
 from rendra_lab.detection.records import Instances, PhotoBatch
@@ -176,7 +175,7 @@ class FurnitureRooms(PhotoData):
             numbers.start,
             numbers.stop,
         )
-        return hashlib.sha256(repr((made_by, *_versions())).encode()).hexdigest()[:16]
+        return hashlib.sha256(repr((made_by, *code_versions())).encode()).hexdigest()[:16]
 
 
 class ModelShapes:
@@ -193,7 +192,7 @@ class ModelShapes:
         self.models = models
         self.voxels = voxels
         self.points = points
-        key = repr((furnished_rooms.EDITION, models.per_name, models.seed, voxels, points, *_versions()))
+        key = repr((furnished_rooms.EDITION, models.per_name, models.seed, voxels, points, *code_versions()))
         name = f"models_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
         self.folder = None if cache is None else cache / name
         self._known: dict[tuple[int, int], SolidShape] = {}
@@ -284,11 +283,3 @@ def _packed(photos: Sequence[RoomPhoto]) -> Tensors:
 def _unpacked(kept: Tensors) -> list[RoomPhoto]:
     count = len(kept) // len(RoomPhoto.names())
     return [RoomPhoto(**{name: kept[f"{i}.{name}"] for name in RoomPhoto.names()}) for i in range(count)]
-
-
-def _versions() -> tuple[str, str]:
-    try:
-        ours = version("rendra")
-    except PackageNotFoundError:
-        ours = "not installed"
-    return ours, torch.__version__

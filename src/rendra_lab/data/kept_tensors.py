@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -16,6 +18,15 @@ from rendra_lab.durable import draft_of
 log = logging.getLogger(__name__)
 
 Tensors = Mapping[str, Tensor]
+
+
+def code_versions() -> tuple[str, str]:
+    """Of rendra and torch: part of the name of whatever they make."""
+    try:
+        ours = version("rendra")
+    except PackageNotFoundError:
+        ours = "not installed"
+    return ours, torch.__version__
 
 
 def kept_or_made(path: Path, what: str, make: Callable[[], Tensors]) -> Tensors:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from rendra.structures import Meshes
 from rendra_lab.data.camera_rigs import look_at_origin, rig
-from rendra_lab.data.kept_tensors import kept_or_made
+from rendra_lab.data.kept_tensors import code_versions, kept_or_made
 from rendra_lab.data.mesh_photographs import MeshPhotographer, Shots
 from rendra_lab.data.posed_images import PosedImages
 from rendra_lab.data.ray_views import Scene, SceneViews
@@ -146,7 +145,7 @@ def fingerprint(photographer: MeshPhotographer, shots: Shots) -> str:
 
 def _determinants(photographer: MeshPhotographer, shots: Shots) -> Iterator[Any]:
     mesh, lights, textures = photographer.mesh, photographer.lights, photographer.mesh.textures
-    yield from (_EDITION, _version("rendra"), torch.__version__, str(mesh.device), photographer.antialias)
+    yield from (_EDITION, *code_versions(), str(mesh.device), photographer.antialias)
     yield from (mesh.verts_packed(), mesh.faces_packed(), type(textures).__name__)
     yield from (getattr(textures, name)() for name in _TEXTURE_PARTS if hasattr(textures, name))
     yield from (getattr(textures, name, None) for name in _TEXTURE_MODES)
@@ -155,13 +154,6 @@ def _determinants(photographer: MeshPhotographer, shots: Shots) -> Iterator[Any]
         if isinstance(value, Tensor):
             yield from (name, value)
     yield from (shots.sizes, shots.intrinsics, shots.distortion, shots.R, shots.T)
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _bounds(verts: Tensor) -> tuple[Tensor, Tensor]:

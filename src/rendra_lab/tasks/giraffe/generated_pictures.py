@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Range, check_numbers
 from rendra_lab.synthesis.object_pictures import ObjectPictures, ObjectWorld
@@ -101,7 +100,7 @@ class GeneratedPictures(PictureData):
     def _fingerprint(self) -> str:
         """16 hexadecimal digits that stand for everything but the seeds that determines pictures."""
         made_by = (type(self.world).__qualname__, self.world.settings(), self.image_size)
-        of = (made_by, _version("rendra"), torch.__version__)
+        of = (made_by, *code_versions())
         return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
 
 
@@ -149,10 +148,3 @@ def boxes_around(masks: Tensor) -> Tensor:
         spans.append(torch.stack([first, torch.where(seen, number + 1, 0).amax(-1)], dim=-1))
     boxes = torch.stack(spans, dim=-1).flatten(2)  # x0, y0, x1, y1
     return (boxes * masks.any(3).any(2)[..., None]).float()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"

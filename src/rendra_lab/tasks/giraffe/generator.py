@@ -6,9 +6,8 @@ Letters: B pictures, N objects of a scene, P = V V rays of a picture, L pieces o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -22,9 +21,7 @@ from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler, Rays
 from rendra_lab.tasks.giraffe.feature_fields import FeatureField, FieldValues, Stretches
 from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
 from rendra_lab.tasks.giraffe.ray_sampling import OwnRays, Pieces, Samples, Sampling, into_boxes
-from rendra_lab.tasks.giraffe.records import Boxes, Cameras, Codes, MadePictures, Scenes
-
-_Part = TypeVar("_Part", Codes, Boxes, Cameras)
+from rendra_lab.tasks.giraffe.records import Codes, MadePictures, Scenes
 
 _AT_ONCE = 16  # samples of the background, before somebody looks what is left to see
 _NOTHING = 1e-7  # light that is none beside all of it
@@ -151,8 +148,9 @@ class Generator(nn.Module):
         """The feature image, and the shares of things in it; without gradients a few pictures at a time."""
         if torch.is_grad_enabled() or scenes.batch_size < 2:
             return self._look_at_once(scenes, noise)
-        at_once = (_FEW if scenes.codes.shape.device.type == "cpu" else _MANY) // self.feature_side**2
-        parts = [self._look_at_once(part, noise) for part in _split(scenes, max(at_once, 1))]
+        size = max((_FEW if scenes.codes.shape.device.type == "cpu" else _MANY) // self.feature_side**2, 1)
+        firsts = range(0, scenes.batch_size, size)
+        parts = [self._look_at_once(scenes.rows(slice(first, first + size)), noise) for first in firsts]
         features, shares = zip(*parts, strict=True)
         return torch.cat(features), torch.cat(shares)
 
@@ -245,17 +243,6 @@ class Generator(nn.Module):
                 f"this generator takes codes of {Z} numbers for objects and {Zb} for the background, got "
                 f"{codes.shape.shape[2]} and {codes.background_shape.shape[1]}"
             )
-
-
-def _split(scenes: Scenes, size: int) -> Iterator[Scenes]:
-    """So many scenes at a time."""
-    for first in range(0, scenes.batch_size, size):
-        rows = slice(first, first + size)
-        yield Scenes(_of(scenes.codes, rows), _of(scenes.boxes, rows), _of(scenes.cameras, rows))
-
-
-def _of(record: _Part, rows: slice) -> _Part:
-    return replace(record, **{name: getattr(record, name)[rows] for name in record.names()})
 
 
 def _summed(hidden: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

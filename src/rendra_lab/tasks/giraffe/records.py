@@ -60,6 +60,10 @@ class Scenes(TensorRecord):
         """B."""
         return len(self.codes.shape)
 
+    def rows(self, numbers: slice | Tensor) -> Scenes:
+        """Some of the scenes, by their numbers."""
+        return self._map(lambda value: value[numbers], lambda value: isinstance(value, Tensor))
+
 
 @dataclass(frozen=True)
 class MadePictures(TensorRecord):

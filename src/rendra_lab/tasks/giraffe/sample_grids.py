@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import colorsys
 import math
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -15,7 +14,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra_lab.random_state import stream
-from rendra_lab.records import TensorRecord
 from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.giraffe.edits import turned
 from rendra_lab.tasks.giraffe.generator import Generator
@@ -68,7 +66,7 @@ class SampleGrid:
 
     def _turned(self, generator: Generator, scenes: Scenes) -> Tensor:
         """One image of scenes below each other, their headings side by side."""
-        few = chosen(scenes, torch.arange(self.turned, device=scenes.codes.shape.device))
+        few = scenes.rows(slice(self.turned))
         angles = [2 * math.pi * number / self.headings for number in range(self.headings)]
         views = [made_of(generator, turned(few, 0, angle)).rgb for angle in angles]
         return torch.cat(views, dim=-1).movedim(1, -1).flatten(0, 1)
@@ -76,22 +74,9 @@ class SampleGrid:
 
 def made_of(generator: Generator, scenes: Scenes) -> MadePictures:
     """The pictures of scenes without noise, a few at once so that little memory is needed."""
-    rows = torch.arange(scenes.batch_size, device=scenes.codes.shape.device).split(_AT_ONCE)
-    parts = [generator(chosen(scenes, few)) for few in rows]
+    firsts = range(0, scenes.batch_size, _AT_ONCE)
+    parts = [generator(scenes.rows(slice(first, first + _AT_ONCE))) for first in firsts]
     return MadePictures(torch.cat([part.rgb for part in parts]), torch.cat([part.shares for part in parts]))
-
-
-def chosen(scenes: Scenes, rows: Tensor) -> Scenes:
-    """Some of the scenes, by their numbers."""
-
-    def picked(record: TensorRecord) -> dict[str, Tensor]:
-        return {name: getattr(record, name).index_select(0, rows) for name in record.names()}
-
-    return Scenes(
-        codes=replace(scenes.codes, **picked(scenes.codes)),
-        boxes=replace(scenes.boxes, **picked(scenes.boxes)),
-        cameras=replace(scenes.cameras, **picked(scenes.cameras)),
-    )
 
 
 def share_images(shares: Float[Tensor, "B T V V"], side: int) -> Float[Tensor, "B S S 3"]:

@@ -7,7 +7,6 @@ import json
 import shutil
 import uuid
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from rendra.body import SMPL
-from rendra_lab.data.kept_tensors import kept_or_made
+from rendra_lab.data.kept_tensors import code_versions, kept_or_made
 from rendra_lab.data.scene_folders import check_folder
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Fraction, Positive, check_numbers
@@ -173,7 +172,7 @@ class GeneratedPeople(PeopleData):
     def _fingerprint(self) -> str:
         """24 hexadecimal digits that stand for everything that determines the pictures."""
         digest = hashlib.sha256()
-        digest.update(repr((_EDITION, _version("rendra"), torch.__version__, self.size, self.seed)).encode())
+        digest.update(repr((_EDITION, *code_versions(), self.size, self.seed)).encode())
         tensors = (*self.body.buffers(), self.crowd.verts, self.crowd.focal_px)
         for tensor in tensors:
             digest.update(repr(tuple(tensor.shape)).encode())
@@ -210,10 +209,3 @@ def detected(
     joints_px += noise_px * effort[..., None] * noise
     lost = torch.rand(confidence.shape, generator=generator) < missing
     return joints_px.masked_fill(lost[..., None], 0), confidence.masked_fill(lost, 0)
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"

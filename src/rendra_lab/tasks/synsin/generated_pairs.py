@@ -5,16 +5,14 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Range, check_numbers
 from rendra_lab.synthesis.posed_views import PosedViews, World, seen_by
@@ -116,7 +114,7 @@ class GeneratedPairs(PairData):
     def _fingerprint(self, count: int) -> str:
         """16 hexadecimal digits that stand for everything but the seed that determines the views of a place."""
         made_by = (type(self.world).__qualname__, self.world.settings(), self.size, count)
-        of = (made_by, _version("rendra"), torch.__version__)
+        of = (made_by, *code_versions())
         return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
 
 
@@ -168,10 +166,3 @@ def _packed(views: PosedViews) -> Tensors:
     """What is kept of views: depth in half of the bits, to a part in 2000."""
     kept: dict[str, Tensor] = {name: getattr(views, name) for name in PosedViews.names()}
     return {**kept, "depth": views.depth.half()}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Positive, Range, check_numbers
 from rendra_lab.shape_records import ShapeBatch
@@ -121,7 +120,7 @@ class FurnitureSingle(ShapeData):
     def _fingerprint(self, count: int) -> str:
         """16 hexadecimal digits that stand for all but the seed and the class that determines a piece's pictures."""
         studio = self.studio
-        of = (EDITION, studio.size, studio.cells, studio.points, count, _version("rendra"), torch.__version__)
+        of = (EDITION, studio.size, studio.cells, studio.points, count, *code_versions())
         return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
 
 
@@ -210,10 +209,3 @@ class PiecePictures:
 
 def _kind(index: int) -> str:
     return CLASSES[index % len(CLASSES)]
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
