@@ -32,10 +32,8 @@ def main(cfg: Any) -> None:
             check_value(options[name], hint, name)
     programs = programs_named(str(options["program"]))
     order = Order(**{field.name: options[field.name] for field in fields(Order)})
-    if options["run"] is None:
-        maker, place = _from_zoo(str(options["zoo"])), Path("outputs", "zoo", str(options["zoo"]))
-    else:
-        maker, place = _from_run(Path(options["run"]), str(options["weights"])), Path(options["run"])
+    maker = _generator(options["run"], str(options["weights"]), str(options["zoo"]))
+    place = Path("outputs", "zoo", str(options["zoo"])) if options["run"] is None else Path(options["run"])
     output = Path(options["output"] or place / "rendering")
     endings = ("gif", "mp4") if can_write_mp4() else ("gif",)
     for program in programs:
@@ -44,26 +42,15 @@ def main(cfg: Any) -> None:
     print(short_path(output))
 
 
-def _from_run(folder: Path, weights: str) -> Any:
-    """The averaged generator of a run; its data are not made again."""
+def _generator(run: str | None, weights: str, kept: str) -> Any:
+    """The averaged generator of a run, whose data are not made again, or one of the zoo."""
     from rendra_lab import zoo
     from rendra_lab.errors import UserError
     from rendra_lab.tasks.giraffe.generator import Generator
 
-    part = zoo.part_of_run(folder, "averaged", "module.generator", weights)
+    part = zoo.load(kept, ZOO) if run is None else zoo.part_of_run(Path(run), "averaged", "module.generator", weights)
     if not isinstance(part, Generator):
-        raise UserError(f"{folder} has no generator of scenes, but a {type(part).__name__}")
-    return part
-
-
-def _from_zoo(name: str) -> Any:
-    from rendra_lab import zoo
-    from rendra_lab.errors import UserError
-    from rendra_lab.tasks.giraffe.generator import Generator
-
-    part = zoo.load(name, ZOO)
-    if not isinstance(part, Generator):
-        raise UserError(f"{name} is no generator of scenes, but a {type(part).__name__}")
+        raise UserError(f"{run or kept} has no generator of scenes, but a {type(part).__name__}")
     return part
 
 

@@ -113,8 +113,11 @@ class ResidualChain(nn.Module):
         resample: of each block; none changes the resolution where it is left out.
         noise_seed: of the noise of evaluation.
         noise_std: see `NoiseBatchNorm`.
-        fold: squares of so many pixels on a side are folded into channels first, and unfolded last: the blocks work
-            at a fraction of the resolution. `channels` and the last width then count those of folded pixels.
+        fold: squares of so many pixels on a side are folded into channels first: the blocks work at a fraction of
+            the resolution. `channels` then counts those of folded pixels.
+        smooth: that resolution is left by bilinear interpolation, with as many channels as the last width; else by
+            unfolding, with the last width that of folded pixels. Unfolded, neighbours have weights of their own, and
+            what no loss holds together shows as a pattern of `fold` pixels.
 
     Raises:
         UserError: `resample` is not one a block, or goes below no resolution that it comes back from.
@@ -128,10 +131,12 @@ class ResidualChain(nn.Module):
         noise_seed: Count = 0,
         noise_std: Amount = 1.0,
         fold: int = 1,
+        smooth: bool = False,
     ) -> None:
         super().__init__()
         steps = list(resample) if resample else ["keep"] * len(widths)
         self.fold = fold
+        self.smooth = smooth
         self.multiple = fold * _deepest(steps, len(widths))
         generator = torch.Generator().manual_seed(noise_seed)
         still = torch.randn(len(widths), 2, NOISE_SIZE, generator=generator)
@@ -144,7 +149,7 @@ class ResidualChain(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, channels / fold^2, H, W) to (B, widths[-1] / fold^2, H, W).
+        """(B, channels / fold^2, H, W) to (B, widths[-1] / fold^2, H, W); if smooth, to (B, widths[-1], H, W).
 
         Raises:
             ValueError: H or W is no multiple of `multiple`.
@@ -156,7 +161,10 @@ class ResidualChain(nn.Module):
             )
         if self.fold == 1:
             return self.blocks(x)
-        return F.pixel_shuffle(self.blocks(F.pixel_unshuffle(x, self.fold)), self.fold)
+        inner = self.blocks(F.pixel_unshuffle(x, self.fold))
+        if self.smooth:
+            return F.interpolate(inner, scale_factor=self.fold, mode="bilinear", align_corners=False)
+        return F.pixel_shuffle(inner, self.fold)
 
 
 def _resampler(resample: Resample) -> nn.Module:

@@ -14,17 +14,19 @@ _LAST_SIDE = 4  # pixels of the last features
 
 
 class Discriminator(nn.Module):
-    """4x4 convolutions that halve the resolution down to 4x4 pixels, without biases or normalisation, and one more.
+    """4x4 convolutions that halve the resolution down to 4x4 pixels, without normalisation, and one more.
 
     Args:
         picture_side: S, a power of two of at least 8.
         widest: channels of the last features; each layer before has half of what follows.
+        biases: of the convolutions. Published: none; then the logit of a black picture is 0 whatever is learned, and
+            a generator that is told off too fast flees there, from where no gradient leads back.
 
     Raises:
         UserError: another side, or fewer channels than layers can halve.
     """
 
-    def __init__(self, picture_side: Positive = 64, widest: Positive = 512) -> None:
+    def __init__(self, picture_side: Positive = 64, widest: Positive = 512, biases: bool = False) -> None:
         super().__init__()
         layers = picture_side.bit_length() - 3
         if layers < 1 or picture_side != _LAST_SIDE << layers:
@@ -38,8 +40,8 @@ class Discriminator(nn.Module):
         widths = [3, *(widest >> (layers - number) for number in range(1, layers + 1))]
         steps: list[nn.Module] = []
         for before, after in pairwise(widths):
-            steps += [nn.Conv2d(before, after, 4, 2, 1, bias=False), nn.LeakyReLU(_SLOPE)]
-        self.layers = nn.Sequential(*steps, nn.Conv2d(widest, 1, _LAST_SIDE, bias=False))
+            steps += [nn.Conv2d(before, after, 4, 2, 1, bias=biases), nn.LeakyReLU(_SLOPE)]
+        self.layers = nn.Sequential(*steps, nn.Conv2d(widest, 1, _LAST_SIDE, bias=biases))
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Logits (B, 1), high for what looks real, of pictures (B, 3, S, S), sRGB in [0, 1].

@@ -126,12 +126,16 @@ class Generator(nn.Module):
             noise: draws noise of densities and depths, as in training; None: neither. What is drawn for whom hangs on
                 whether gradients are wanted.
         """
-        features, shares = self._look(scenes, noise)
-        return MadePictures(self.renderer(features), shares)
+        parts = []
+        for part in self._parts(scenes):
+            features, shares = self._look(part, noise)
+            parts.append((self.renderer(features), shares))
+        pictures, shares = (torch.cat(each) for each in zip(*parts, strict=True))
+        return MadePictures(pictures, shares)
 
     def feature_image(self, scenes: Scenes) -> Float[Tensor, "B C V V"]:
         """What the neural renderer is given."""
-        return self._look(scenes, None)[0]
+        return torch.cat([self._look(part, None)[0] for part in self._parts(scenes)])
 
     def alpha_maps(self, scenes: Scenes) -> Float[Tensor, "B T V V"]:
         """Opacity of each object, and last of the background, as if it were alone in the world."""
@@ -144,17 +148,15 @@ class Generator(nn.Module):
             samples, alone(samples.objects, objects.density), alone(samples.background, background.density), scenes
         )
 
-    def _look(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """The feature image, and the shares of things in it; without gradients a few pictures at a time."""
+    def _parts(self, scenes: Scenes) -> list[Scenes]:
+        """As many at once as near memory holds without gradients, which need all at once."""
         if torch.is_grad_enabled() or scenes.batch_size < 2:
-            return self._look_at_once(scenes, noise)
+            return [scenes]
         size = max((_FEW if scenes.codes.shape.device.type == "cpu" else _MANY) // self.feature_side**2, 1)
-        firsts = range(0, scenes.batch_size, size)
-        parts = [self._look_at_once(scenes.rows(slice(first, first + size)), noise) for first in firsts]
-        features, shares = zip(*parts, strict=True)
-        return torch.cat(features), torch.cat(shares)
+        return [scenes.rows(slice(first, first + size)) for first in range(0, scenes.batch_size, size)]
 
-    def _look_at_once(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    def _look(self, scenes: Scenes, noise: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """The feature image, and the shares of things in it."""
         rays, own = self._rays(scenes)
         samples = self.sampling.samples(rays, own, scenes.boxes.exists, noise)
         objects = self._objects(scenes, own, samples.objects, noise)

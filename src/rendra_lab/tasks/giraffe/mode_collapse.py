@@ -20,7 +20,6 @@ from rendra_lab.callbacks import every
 from rendra_lab.random_state import stream
 from rendra_lab.settings import Count, Fraction, Positive
 from rendra_lab.tasks.giraffe.records import PictureBatch
-from rendra_lab.tasks.giraffe.sample_grids import made_of
 from rendra_lab.tasks.giraffe.task import Giraffe
 
 _COARSE_PX = 16
@@ -84,7 +83,7 @@ class ModeCollapseWatcher(Callback):
     def varieties(self, task: Giraffe, real: Tensor) -> tuple[float, float]:
         """Both numbers, of the trained generator's samples beside as many different real pictures as `coarse`."""
         scenes = task.generator.sample(len(real), stream(self.seed))
-        made = distances(coarse(made_of(task.generator, scenes).rgb))
+        made = distances(coarse(task.generator(scenes).rgb))
         true = distances(real)
         return _ratio(made[0], true[0]), _ratio(made[1], true[1])
 

@@ -17,10 +17,9 @@ from rendra_lab.random_state import stream
 from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.giraffe.edits import turned
 from rendra_lab.tasks.giraffe.generator import Generator
-from rendra_lab.tasks.giraffe.records import MadePictures, Scenes
+from rendra_lab.tasks.giraffe.records import Scenes
 
 _BACKGROUND = (0.25, 0.25, 0.25)
-_AT_ONCE = 16  # pictures
 
 
 class SampleGrid:
@@ -58,7 +57,7 @@ class SampleGrid:
             where there are objects.
         """
         scenes = generator.sample(self.samples, stream(self.seed), self.temperature)
-        made = made_of(generator, scenes)
+        made = generator(scenes)
         images = {"samples": made.rgb.movedim(1, -1), "objects": share_images(made.shares, made.rgb.shape[-1])}
         if self.turned and generator.objects:
             images["turned"] = self._turned(generator, scenes)
@@ -68,15 +67,8 @@ class SampleGrid:
         """One image of scenes below each other, their headings side by side."""
         few = scenes.rows(slice(self.turned))
         angles = [2 * math.pi * number / self.headings for number in range(self.headings)]
-        views = [made_of(generator, turned(few, 0, angle)).rgb for angle in angles]
+        views = [generator(turned(few, 0, angle)).rgb for angle in angles]
         return torch.cat(views, dim=-1).movedim(1, -1).flatten(0, 1)
-
-
-def made_of(generator: Generator, scenes: Scenes) -> MadePictures:
-    """The pictures of scenes without noise, a few at once so that little memory is needed."""
-    firsts = range(0, scenes.batch_size, _AT_ONCE)
-    parts = [generator(scenes.rows(slice(first, first + _AT_ONCE))) for first in firsts]
-    return MadePictures(torch.cat([part.rgb for part in parts]), torch.cat([part.shares for part in parts]))
 
 
 def share_images(shares: Float[Tensor, "B T V V"], side: int) -> Float[Tensor, "B S S 3"]:

@@ -17,7 +17,8 @@ from rendra_lab.settings import Amount, Count, Positive
 from rendra_lab.tasks.synsin.hole_filling import filled
 
 _LEAST_COVER = 1e-3  # of a pixel: where there is less, the colour is nobody's
-_RETOUCHED = 0.05  # of what the decoder would change, where points cover a pixel; holes are its own
+_PAINTED = 0.5  # of the way to white or black, the furthest that the decoder moves colours of holes
+_RETOUCHED = 0.02  # the same where points cover a pixel
 _COVERED = 0.25  # what is covered by so much is no hole
 
 
@@ -67,7 +68,7 @@ class RefinementDecoder(nn.Module):
         fold: the blocks see squares of `fold` x `fold` pixels as one, with more channels.
         keep_color: the first four features are colours and how much of a pixel they cover, as `FeatureEncoder`
             keeps them. Holes take the colours about them, and the tanh says how far towards white or black each
-            channel of that moves: little where points fell, as far as it likes in holes.
+            channel of that moves: little where points fell, half the way at most in holes, and alike in neighbours.
         noise_seed, noise_std: see `NoiseBatchNorm`.
     """
 
@@ -86,9 +87,10 @@ class RefinementDecoder(nn.Module):
             raise UserError(f"a decoder that keeps colours needs channels of at least 4, got {channels}")
         self.channels = channels
         self.keep_color = keep_color
-        outer = [*widths, 3 * fold**2]
+        outer = [*widths, 3 if keep_color else 3 * fold**2]
         # odd: other noise than the encoder's of the same seed
-        self.chain = ResidualChain(channels * fold**2, outer, resample, 2 * noise_seed + 1, noise_std, fold)
+        odd = 2 * noise_seed + 1
+        self.chain = ResidualChain(channels * fold**2, outer, resample, odd, noise_std, fold, keep_color)
 
     def forward(self, features: Tensor) -> Tensor:
         """Pictures (B, 3, H, W) of features (B, C, H, W).
@@ -104,5 +106,6 @@ class RefinementDecoder(nn.Module):
         cover = weights.clamp(0, 1)
         given = filled((features[:, :3] / weights.clamp_min(_LEAST_COVER)).clamp(-1, 1), cover)
         answer = torch.tanh(self.chain(torch.cat([given, features[:, 3:]], 1)))
-        change = torch.lerp(answer, _RETOUCHED * answer, (cover / _COVERED).clamp_max(1))
+        reach = _PAINTED + (_RETOUCHED - _PAINTED) * (cover / _COVERED).clamp_max(1)
+        change = reach * answer
         return 0.5 * (given * (1 - change.abs()) + change) + 0.5

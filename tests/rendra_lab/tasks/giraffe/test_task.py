@@ -23,7 +23,7 @@ from rendra_lab.tasks.giraffe.mode_collapse import ModeCollapseWatcher
 from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
 from rendra_lab.tasks.giraffe.ray_sampling import BoxSampling
 from rendra_lab.tasks.giraffe.records import PictureBatch
-from rendra_lab.tasks.giraffe.sample_grids import SampleGrid, made_of, share_images
+from rendra_lab.tasks.giraffe.sample_grids import SampleGrid, share_images
 from rendra_lab.tasks.giraffe.task import Giraffe
 from rendra_lab.terms import LossTerm
 
@@ -161,7 +161,7 @@ def test_many_scenes_are_made_a_few_at_once() -> None:
     maker = generator().eval()
     scenes = maker.sample(19, stream(3))
     with torch.no_grad():
-        made = made_of(maker, scenes)
+        made = maker(scenes)
         last = maker(scenes.rows(torch.tensor([18])))
     assert len(made.rgb) == len(made.shares) == 19
     torch.testing.assert_close(made.rgb[18:], last.rgb)
