@@ -104,6 +104,17 @@ def test_a_chain_keeps_the_resolution_and_gives_finite_gradients(fold: int) -> N
     assert all(isinstance(one, Tensor) and bool(one.isfinite().all()) for one in gradients)
 
 
+def test_a_smooth_chain_makes_no_pattern_of_what_has_none() -> None:
+    even = torch.ones(1, 3, 24, 24)
+    for smooth in (False, True):
+        torch.manual_seed(0)
+        chain = ResidualChain(12, [8, 12], fold=2, smooth=smooth).eval()
+        made = chain(even)
+        assert made.shape[1:] == ((12, 24, 24) if smooth else (3, 24, 24))
+        spread = made[..., 10:14, 10:14].flatten(2).std(2)  # further from zeros around than convolutions reach
+        assert bool((spread < 1e-5).all()) is smooth
+
+
 def test_no_pictures_give_no_features() -> None:
     assert ResidualChain(3, [4, 2]).eval()(torch.zeros(0, 3, 8, 8)).shape == (0, 2, 8, 8)
 

@@ -113,12 +113,12 @@ def test_evaluation_draws_other_scenes_for_each_batch_and_the_same_each_time() -
 
 
 def test_the_average_follows_every_step_and_is_what_is_seen() -> None:
-    task, states = giraffe(decay=0.75), States()
+    task, states = giraffe(decay=0.3), States()
     expected = weights(task.generator)
-    fit(task, 3, states)
-    assert len(states.raw) == 3
-    for raw, averaged in zip(states.raw, states.averaged, strict=True):
-        expected = 0.75 * expected + 0.25 * raw
+    fit(task, 4, states)
+    assert len(states.raw) == 4
+    for decay, raw, averaged in zip((2 / 11, 3 / 12, 0.3, 0.3), states.raw, states.averaged, strict=True):
+        expected = decay * expected + (1 - decay) * raw
         torch.testing.assert_close(averaged, expected)
     assert not torch.equal(weights(task.averaged), weights(task.generator))
     scenes = task.averaged.sample(3, stream(0, 0, 2, 0))
