@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from rendra_lab.settings import Amount, Count, Fraction
+from rendra_lab.settings import Amount, Count
 from rendra_lab.terms import PiecewiseLinear
 
 
@@ -32,20 +32,6 @@ def exponential(optimizer: Optimizer, total_steps: int, final_factor: Amount = 0
     if final_factor <= 0:
         raise ValueError(f"final_factor must be above 0, got {final_factor}")
     return LambdaLR(optimizer, lambda step: final_factor ** (step / max(total_steps, 1)))
-
-
-def cooled(optimizer: Optimizer, total_steps: int, share: Fraction = 0.2, final_factor: Amount = 0.01) -> LambdaLR:
-    """The optimizer's rate until the last `share` of the run, in which it falls evenly to `final_factor` times that.
-
-    Source: Haegele et al., "Scaling Laws and Compute-Optimal Training Beyond Fixed Training Durations", NeurIPS 2024.
-    """
-    cooling = max(share * total_steps, 1)
-
-    def factor(step: int) -> float:
-        progress = min(max((step - total_steps + cooling) / cooling, 0.0), 1.0)
-        return 1 - (1 - final_factor) * progress
-
-    return LambdaLR(optimizer, factor)
 
 
 def piecewise(optimizer: Optimizer, knots: Sequence[Sequence[float]]) -> LambdaLR:

@@ -115,7 +115,6 @@ def test_an_optimizer_that_needs_residuals_gets_them() -> None:
         (partial(schedulers.cosine, final_factor=0.5), 0.5),
         (partial(schedulers.cosine, final_factor=0.5, warmup_steps=2), 0.5),
         (partial(schedulers.exponential, final_factor=0.1), 0.1),
-        (partial(schedulers.cooled, share=0.5, final_factor=0.1), 0.1),
         (partial(schedulers.restarted, final_factor=0.2), 0.2),
         (partial(torch.optim.lr_scheduler.StepLR, step_size=2, gamma=0.5), 0.25),
     ],
@@ -124,12 +123,6 @@ def test_schedulers_reach_their_end_with_the_run(scheduler: Any, factor: float) 
     run = trainer(steps=4)
     run.fit(task(scheduler=scheduler), datamodule=ToyData(steps=4))
     assert run.optimizers[0].param_groups[0]["lr"] == pytest.approx(0.1 * factor)
-
-
-def test_a_rate_is_full_until_it_cools() -> None:
-    scheduler = schedulers.cooled(torch.optim.Adam([torch.zeros(1)], lr=1.0), total_steps=10, share=0.4)
-    factor = scheduler.lr_lambdas[0]
-    assert [factor(step) for step in (0, 5, 6, 8, 10, 12)] == pytest.approx([1, 1, 1, 0.505, 0.01, 0.01])
 
 
 def test_a_restart_is_another_optimizer_taking_over() -> None:
