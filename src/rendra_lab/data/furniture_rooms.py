@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from rendra_lab.data.announced import announced
 from rendra_lab.data.epochs import Samples
-from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, fingerprint, kept_or_made
 from rendra_lab.data.photo_data import PhotoData, PhotoSplits, joined_shapes
 from rendra_lab.data.pix3d_writer import checked_folder, keys_of, write_pix3d
 from rendra_lab.detection.records import Instances, PhotoBatch
@@ -175,7 +174,7 @@ class FurnitureRooms(PhotoData):
             numbers.start,
             numbers.stop,
         )
-        return hashlib.sha256(repr((made_by, *code_versions())).encode()).hexdigest()[:16]
+        return fingerprint(made_by)
 
 
 class ModelShapes:
@@ -192,8 +191,7 @@ class ModelShapes:
         self.models = models
         self.voxels = voxels
         self.points = points
-        key = repr((furnished_rooms.EDITION, models.per_name, models.seed, voxels, points, *code_versions()))
-        name = f"models_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+        name = f"models_{fingerprint(furnished_rooms.EDITION, models.per_name, models.seed, voxels, points)}"
         self.folder = None if cache is None else cache / name
         self._known: dict[tuple[int, int], SolidShape] = {}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import zlib
 from collections.abc import Callable, Mapping
@@ -27,6 +28,11 @@ def code_versions() -> tuple[str, str]:
     except PackageNotFoundError:
         ours = "not installed"
     return ours, torch.__version__
+
+
+def fingerprint(*determinants: object) -> str:
+    """16 hexadecimal digits that stand for all that determines what is made: these, as they print, and the code."""
+    return hashlib.sha256(repr((*determinants, *code_versions())).encode()).hexdigest()[:16]
 
 
 def kept_or_made(path: Path, what: str, make: Callable[[], Tensors]) -> Tensors:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, fingerprint, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Range, check_numbers
 from rendra_lab.synthesis.object_pictures import ObjectPictures, ObjectWorld
@@ -100,8 +99,7 @@ class GeneratedPictures(PictureData):
     def _fingerprint(self) -> str:
         """16 hexadecimal digits that stand for everything but the seeds that determines pictures."""
         made_by = (type(self.world).__qualname__, self.world.settings(), self.image_size)
-        of = (made_by, *code_versions())
-        return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
+        return fingerprint(made_by)
 
 
 class KnownPictures:

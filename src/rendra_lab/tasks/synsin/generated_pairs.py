@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, fingerprint, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Range, check_numbers
 from rendra_lab.synthesis.posed_views import PosedViews, World, seen_by
@@ -114,8 +113,7 @@ class GeneratedPairs(PairData):
     def _fingerprint(self, count: int) -> str:
         """16 hexadecimal digits that stand for everything but the seed that determines the views of a place."""
         made_by = (type(self.world).__qualname__, self.world.settings(), self.size, count)
-        of = (made_by, *code_versions())
-        return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
+        return fingerprint(made_by)
 
 
 class ViewPairs:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rendra_lab.data.announced import announced
-from rendra_lab.data.kept_tensors import Tensors, code_versions, kept_or_made
+from rendra_lab.data.kept_tensors import Tensors, fingerprint, kept_or_made
 from rendra_lab.errors import UserError
 from rendra_lab.settings import Count, Positive, Range, check_numbers
 from rendra_lab.shape_records import ShapeBatch
@@ -120,8 +119,7 @@ class FurnitureSingle(ShapeData):
     def _fingerprint(self, count: int) -> str:
         """16 hexadecimal digits that stand for all but the seed and the class that determines a piece's pictures."""
         studio = self.studio
-        of = (EDITION, studio.size, studio.cells, studio.points, count, *code_versions())
-        return hashlib.sha256(repr(of).encode()).hexdigest()[:16]
+        return fingerprint(EDITION, studio.size, studio.cells, studio.points, count)
 
 
 class KeptPiece:
