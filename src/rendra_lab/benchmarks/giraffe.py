@@ -38,7 +38,7 @@ def _paper(sampling: Sampling) -> Generator:
 def _small() -> Generator:
     """As conf/network/small_of/giraffe.yaml."""
     fields = (
-        FeatureField(64, 64, 6, 64, 6, 2, [3], density_scale=10.0),
+        FeatureField(64, 64, 6, 64, 6, 0, [3], density_scale=10.0),
         FeatureField(64, 64, 4, 32, 6, 6, point_scale=6.0),
     )
     return Generator(*fields, NeuralRenderer(64), BoxSampling(), *_world(20.0))
@@ -55,7 +55,7 @@ def _pictures(*, dense: bool) -> Callable[[Library, Scene], Run]:
 
 def _step(library: Library, scene: Scene) -> Run:
     """Gradients of both objectives, R1 among them, without their optimizers."""
-    network, judge = _small().to(scene.device), Discriminator(64, 256, biases=True).to(scene.device)
+    network, judge = _small().to(scene.device), Discriminator(64, 256).to(scene.device)
     draw, real = torch.Generator().manual_seed(0), torch.rand(_BATCH, 3, 64, 64, device=scene.device)
 
     def run() -> None:

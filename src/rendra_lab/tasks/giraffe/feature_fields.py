@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
+from rendra_lab.networks.initialization import begin_as_varied
 from rendra_lab.settings import Count, Positive, Size
 
 _FEW, _MANY = 4096, 1 << 20  # points at a time, which fit into a core's cache, or keep a GPU busy
@@ -49,11 +50,13 @@ class FeatureField(nn.Module):
         hidden: units of each layer.
         layers: before the density.
         code: numbers of each latent code.
-        point_octaves, view_octaves: frequencies pi, 2 pi, 4 pi .. of the encodings.
+        point_octaves, view_octaves: frequencies pi, 2 pi, 4 pi .. of the encodings; without any of the view's, a
+            point looks the same from everywhere.
         skips: layers, counted from 1, behind which points and shape are added once more; but not behind the last.
         point_scale: points are divided by it before they are encoded.
         views_downscaled: directions too, as in the published code.
         density_scale: densities are multiplied by it.
+        torch_start: weights begin as PyTorch's do, as published: then everything looks nearly the same at first.
 
     Raises:
         UserError: skips that no layer has.
@@ -66,11 +69,12 @@ class FeatureField(nn.Module):
         layers: Positive = 8,
         code: Positive = 256,
         point_octaves: Positive = 10,
-        view_octaves: Positive = 4,
+        view_octaves: Count = 4,
         skips: Sequence[Count] = (),
         point_scale: Size = 2.0,
         views_downscaled: bool = False,
         density_scale: Size = 1.0,
+        torch_start: bool = False,
     ) -> None:
         super().__init__()
         if not all(1 <= number < layers for number in skips):
@@ -87,8 +91,10 @@ class FeatureField(nn.Module):
         self.to_density = nn.Linear(hidden, 1)
         self.to_view = nn.Linear(hidden, hidden)
         self.from_appearance = nn.Linear(code, hidden)
-        self.from_directions = nn.Linear(6 * view_octaves, hidden)
+        self.from_directions = nn.Linear(6 * view_octaves, hidden) if view_octaves else None
         self.out = nn.Linear(hidden, features)
+        if not torch_start:
+            self._begin()
 
     def forward(self, at: Stretches, shape: Float[Tensor, "T Z"], appearance: Float[Tensor, "T Z"]) -> FieldValues:
         """Densities before noise, and hidden features, at points of things with these codes.
@@ -112,6 +118,19 @@ class FeatureField(nn.Module):
             density[rows, :most], hidden[rows, :most] = values.density, values.hidden
         return FieldValues(density, hidden)
 
+    def _begin(self) -> None:
+        for layer in self.trunk:
+            assert isinstance(layer, nn.Linear)
+            begin_as_varied(layer)
+        for layer in (self.from_points, self.from_shape, *self.skips_from_points, *self.skips_from_shape):
+            assert isinstance(layer, nn.Linear)
+            begin_as_varied(layer, summands=2)
+        of_ray = [self.to_view, self.from_appearance, *([self.from_directions] if self.from_directions else [])]
+        for layer in of_ray:
+            begin_as_varied(layer, summands=len(of_ray))
+        for layer in (self.to_density, self.out):
+            begin_as_varied(layer, slope=1.0)
+
     def _at(self, at: Stretches, shape: Tensor, appearance: Tensor) -> FieldValues:
         points = at.origins.T[:, :, None] + at.depths * at.directions.T[:, :, None]
         encoded = octaves(points / self.point_scale, self.point_octaves).flatten(1).mT
@@ -124,9 +143,11 @@ class FeatureField(nn.Module):
             if number in skips:
                 of_points, of_shape = skips[number]
                 x = (of_points(encoded).unflatten(0, rows) + each(of_shape(shape))).flatten(0, 1) + x
-        directions = F.normalize(at.directions.T, dim=0) / (self.point_scale if self.views_downscaled else 1.0)
-        of_ray = self.from_directions(octaves(directions, self.view_octaves).mT)[:, None]
-        hidden = F.relu_(self.to_view(x).unflatten(0, rows) + (each(self.from_appearance(appearance)) + of_ray))
+        of_ray = each(self.from_appearance(appearance))
+        if self.from_directions is not None:
+            directions = F.normalize(at.directions.T, dim=0) / (self.point_scale if self.views_downscaled else 1.0)
+            of_ray = of_ray + self.from_directions(octaves(directions, self.view_octaves).mT)[:, None]
+        hidden = F.relu_(self.to_view(x).unflatten(0, rows) + of_ray)
         return FieldValues(self.to_density(x).view(rows), hidden)
 
     def to_features(self, hidden: Float[Tensor, "L H"], weight: Float[Tensor, " L"]) -> Float[Tensor, "L C"]:

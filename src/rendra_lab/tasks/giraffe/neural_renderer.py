@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
+from rendra_lab.networks.initialization import begin_as_varied
 from rendra_lab.settings import Positive
 
 _SLOPE = 0.2  # of leaky ReLUs
@@ -27,6 +28,7 @@ class NeuralRenderer(nn.Module):
         rgb_skips: colours are summed over all resolutions; false takes those of the last alone.
         sigmoid: at the end; false clamps nothing.
         feature_upsampling, rgb_upsampling: `nearest` or `bilinear`, that followed by a small blur for the colours.
+        torch_start: weights begin as PyTorch's do, as published.
 
     Raises:
         UserError: sizes that are not a power of two apart.
@@ -42,6 +44,7 @@ class NeuralRenderer(nn.Module):
         sigmoid: bool = True,
         feature_upsampling: Literal["nearest", "bilinear"] = "nearest",
         rgb_upsampling: Literal["nearest", "bilinear"] = "bilinear",
+        torch_start: bool = False,
     ) -> None:
         super().__init__()
         doublings = (max(picture_side // feature_side, 1)).bit_length() - 1
@@ -54,12 +57,16 @@ class NeuralRenderer(nn.Module):
         self.features, self.feature_side, self.picture_side = features, feature_side, picture_side
         self.sigmoid = sigmoid
         self.feature_upsampling, self.rgb_upsampling = feature_upsampling, rgb_upsampling
-        self.blocks = nn.ModuleList(nn.Conv2d(before, after, 3, padding=1) for before, after in pairwise(widths))
+        convs = [nn.Conv2d(before, after, 3, padding=1) for before, after in pairwise(widths)]
+        self.blocks = nn.ModuleList(convs)
         self.to_rgb = nn.ModuleList(
             nn.Conv2d(width, 3, 3, padding=1) if rgb_skips or number == doublings else nn.Identity()
             for number, width in enumerate(widths)
         )
         self.rgb_skips = rgb_skips
+        if not torch_start:
+            for conv in convs:
+                begin_as_varied(conv, _SLOPE)
 
     def forward(self, features: Tensor) -> Tensor:
         """Pictures (B, 3, S, S), in [0, 1] with the sigmoid, of features (B, C, V, V)."""

@@ -17,7 +17,7 @@ from rendra_lab.errors import UserError
 from rendra_lab.tasks.giraffe import feature_fields, generator
 from rendra_lab.tasks.giraffe.box_sampler import BoxSampler, rotation_about_z
 from rendra_lab.tasks.giraffe.camera_sampler import CameraSampler
-from rendra_lab.tasks.giraffe.feature_fields import FeatureField
+from rendra_lab.tasks.giraffe.feature_fields import FeatureField, Stretches
 from rendra_lab.tasks.giraffe.generator import Generator
 from rendra_lab.tasks.giraffe.neural_renderer import NeuralRenderer
 from rendra_lab.tasks.giraffe.ray_sampling import BoxSampling, DenseSampling, Sampling
@@ -32,7 +32,8 @@ def made(sampling: Sampling | None = None, objects: int = 2, **boxes: Any) -> Ge
     """Fields dense enough to hide things."""
     torch.manual_seed(0)
     object_field = FeatureField(8, 16, 4, 6, 3, 2, [2], density_scale=40.0)
-    background_field = FeatureField(8, 8, 3, 4, 3, 2, point_scale=6.0, density_scale=2.0)
+    nn.init.constant_(object_field.to_density.bias, 1.0)
+    background_field = FeatureField(8, 8, 3, 4, 3, 2, point_scale=6.0, density_scale=0.2)
     sampler = BoxSampler(objects, ([0.3] * 3, [0.4] * 3), ([-0.3, -0.3, 0.0], [0.3, 0.3, 0.0]), **boxes)
     cameras = CameraSampler(30.0, polar=(0.3, 0.45), background_turns=(0.0, 0.25))
     return Generator(
@@ -100,6 +101,16 @@ def plain(
     views = encoded(nn.functional.normalize(directions, dim=-1), field.view_octaves)[:, :, None]
     hidden = (field.to_view(x) + each(field.from_appearance(look)) + field.from_directions(views)).relu()
     return field.to_density(x).squeeze(-1), field.out(hidden)
+
+
+@pytest.mark.parametrize("view_octaves", [0, 2])
+def test_without_octaves_of_the_view_a_point_looks_the_same_from_everywhere(view_octaves: int) -> None:
+    field = FeatureField(8, 8, 3, 4, 2, view_octaves)
+    origins, codes = torch.randn(1, 3, generator=drawn()).expand(2, 3), torch.randn(1, 4, generator=drawn())
+    either = Stretches(torch.zeros(2).long(), origins, torch.eye(3)[:2], torch.zeros(2, 1), torch.ones(2, 1).bool())
+    density, hidden = field(either, codes, codes)
+    assert_close(density[0], density[1])
+    assert bool((hidden[0] == hidden[1]).all()) == (view_octaves == 0)
 
 
 def test_dense_samples_with_exact_skipping_are_the_published_formula() -> None:

@@ -63,7 +63,7 @@ def test_a_discriminator_halves_down_to_four_pixels() -> None:
     logits = network(pictures)
     assert logits.shape == (3, 1)
     slope = torch.autograd.grad(logits.sum(), pictures, create_graph=True)[0]
-    slope.square().sum().backward()
+    (slope.square().sum() + logits.sum()).backward()
     assert all(each.grad is not None and bool(each.grad.isfinite().all()) for each in network.parameters())
     with pytest.raises(ValueError, match=r"judges pictures \(B, 3, 32, 32\), got \(3, 3, 16, 16\)"):
         network(torch.rand(3, 3, 16, 16))
@@ -71,3 +71,12 @@ def test_a_discriminator_halves_down_to_four_pixels() -> None:
         Discriminator(48)
     with pytest.raises(UserError, match="widest must be at least 8"):
         Discriminator(64, 4)
+
+
+@torch.no_grad()
+def test_a_discriminator_judges_colours_about_0_or_as_published_from_0() -> None:
+    torch.manual_seed(0)
+    grey, black = torch.full((1, 3, 32, 32), 0.5), torch.zeros(1, 3, 32, 32)
+    assert float(Discriminator(32, 16)(grey)) == 0
+    assert float(Discriminator(32, 16)(black)) != 0
+    assert float(Discriminator(32, 16, biases=False, centred=False)(black)) == 0
