@@ -39,9 +39,9 @@ def _small() -> Generator:
     """As conf/network/small_of/giraffe.yaml."""
     fields = (
         FeatureField(64, 64, 6, 64, 6, 0, [3], density_scale=10.0),
-        FeatureField(64, 64, 4, 32, 6, 6, point_scale=6.0),
+        FeatureField(64, 64, 4, 32, 7, 6, point_scale=6.0),
     )
-    return Generator(*fields, NeuralRenderer(64), BoxSampling(), *_world(20.0))
+    return Generator(*fields, NeuralRenderer(64), BoxSampling(), *_world(20.0), background_density_noise=0.0)
 
 
 def _pictures(*, dense: bool) -> Callable[[Library, Scene], Run]:

@@ -46,8 +46,8 @@ class Generator(nn.Module):
         sampling: where rays are looked at.
         boxes: draws where objects are.
         cameras: draws who looks, and casts rays.
-        density_noise: standard deviation of what is added to densities, before the ReLU and before boxes end, where
-            `forward` is given noise; published: 1.
+        density_noise, background_density_noise: standard deviation of what is added to densities, before the ReLU
+            and before boxes end, where `forward` is given noise; published: 1.
 
     Raises:
         UserError: networks that do not fit each other.
@@ -62,6 +62,7 @@ class Generator(nn.Module):
         boxes: BoxSampler,
         cameras: CameraSampler,
         density_noise: Amount = 1.0,
+        background_density_noise: Amount = 1.0,
     ) -> None:
         super().__init__()
         made = object_field.features, background_field.features
@@ -76,7 +77,7 @@ class Generator(nn.Module):
         self.sampling = sampling
         self.boxes = boxes
         self.cameras = cameras
-        self.density_noise = density_noise
+        self.density_noise, self.background_density_noise = density_noise, background_density_noise
 
     @property
     def picture_side(self) -> int:
@@ -184,7 +185,8 @@ class Generator(nn.Module):
         directions = own.directions.flatten(0, 1).index_select(0, at.thing * pixels + at.ray % pixels)
         origins = own.origins.index_select(0, at.thing)
         codes = scenes.codes.shape.flatten(0, 1), scenes.codes.appearance.flatten(0, 1)
-        return self._evaluated(self.object_field, at, (origins, directions), codes, noise)
+        raw = self.object_field(Stretches(at.thing, origins, directions, at.depths, at.inside), *codes)
+        return _evaluated(raw, self.object_field.density_scale, at, self.density_noise, noise)
 
     def _background(self, scenes: Scenes, rays: Rays, at: Pieces, noise: torch.Generator | None) -> FieldValues:
         """The same of the background, which turns about z."""
@@ -192,7 +194,8 @@ class Generator(nn.Module):
         origins = (turn @ rays.origins[..., None]).squeeze(-1).index_select(0, at.thing)
         directions = (rays.directions @ turn.mT).flatten(0, 1).index_select(0, at.ray)
         codes = scenes.codes.background_shape, scenes.codes.background_appearance
-        return self._evaluated(self.background_field, at, (origins, directions), codes, noise)
+        raw = self.background_field(Stretches(at.thing, origins, directions, at.depths, at.inside), *codes)
+        return _evaluated(raw, self.background_field.density_scale, at, self.background_density_noise, noise)
 
     def _in_steps(
         self, scenes: Scenes, rays: Rays, samples: Samples, objects: Tensor, noise: torch.Generator | None
@@ -215,20 +218,6 @@ class Generator(nn.Module):
         hidden, shares = (torch.stack(each).sum(0) for each in zip(*sums, strict=True))
         return weights[0], (hidden, shares)
 
-    def _evaluated(
-        self,
-        field: FeatureField,
-        at: Pieces,
-        rays: tuple[Tensor, Tensor],
-        codes: tuple[Tensor, Tensor],
-        noise: torch.Generator | None,
-    ) -> FieldValues:
-        raw, hidden = field(Stretches(at.thing, *rays, at.depths, at.inside), *codes)
-        if noise is not None and self.density_noise > 0:
-            drawn = torch.randn(raw.shape, generator=noise, device=noise.device)
-            raw = raw + self.density_noise * drawn.to(raw)
-        return FieldValues(field.density_scale * F.relu(raw) * at.inside, hidden)
-
     def _maps(self, samples: Samples, objects: Tensor, background: Tensor, scenes: Scenes) -> Tensor:
         """Numbers of pieces (L,) and of rays (R,) as images (B, N + 1, V, V)."""
         things, side = scenes.boxes.exists.numel(), self.feature_side
@@ -250,3 +239,14 @@ class Generator(nn.Module):
 def _summed(hidden: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Hidden features (L, H) of pieces, their samples weighted, and the weights' sums (L,)."""
     return torch.einsum("lkh,lk->lh", hidden, weights), weights.sum(1)
+
+
+def _evaluated(
+    raw: FieldValues, density_scale: float, at: Pieces, deviation: float, noise: torch.Generator | None
+) -> FieldValues:
+    """Densities that count, of those that a field gives."""
+    density = raw.density
+    if noise is not None and deviation > 0:
+        drawn = torch.randn(density.shape, generator=noise, device=noise.device)
+        density = density + deviation * drawn.to(density)
+    return FieldValues(density_scale * F.relu(density) * at.inside, raw.hidden)

@@ -190,6 +190,8 @@ class BoxSampling(Sampling):
         in_background: samples of each ray.
         near, far: depths between which the background is.
         padding: see Sampling.
+        shaken_background: depths in the background are random in training, too: what is finer than their distance
+            is averaged away then.
 
     Raises:
         UserError: numbers that cannot be.
@@ -202,6 +204,7 @@ class BoxSampling(Sampling):
         near: Amount = 0.5,
         far: Size = 6.0,
         padding: Amount = 0.1,
+        shaken_background: bool = False,
     ) -> None:
         if in_box < 1 or in_background < 1 or not 0 <= near < far:
             raise UserError(
@@ -209,6 +212,7 @@ class BoxSampling(Sampling):
                 f"in_background={in_background}, near={near}, far={far}"
             )
         self.in_box, self.in_background, self.near, self.far, self.padding = in_box, in_background, near, far, padding
+        self.shaken_background = shaken_background
 
     def samples(self, rays: Rays, own: OwnRays, exists: Tensor, noise: torch.Generator | None) -> Samples:
         """See Sampling."""
@@ -217,7 +221,7 @@ class BoxSampling(Sampling):
         every = torch.arange(batch * pixels, device=stretch.device)
         background = self._pieces(
             every, every // pixels, torch.full_like(stretch, self.near), torch.full_like(stretch, self.far),
-            stretch, self.in_background, 0, noise,
+            stretch, self.in_background, 0, noise if self.shaken_background else None,
         )  # fmt: skip
         thing, ray, enter, leave = _hits(own, exists)
         first = self.in_background + thing % exists.shape[1] * self.in_box

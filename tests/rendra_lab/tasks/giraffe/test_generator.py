@@ -163,6 +163,18 @@ def test_whatever_exists_pictures_and_gradients_are_finite(sampling: Sampling, e
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("deviation", [0.0, 1.0])
+def test_a_background_is_noisy_in_training_where_asked(deviation: float) -> None:
+    network = made(BoxSampling(4, 3))
+    network.background_density_noise = deviation
+    scenes = network.sample(3, drawn())
+    nobody = replace(scenes, boxes=replace(scenes.boxes, exists=torch.zeros(3, 2, dtype=torch.bool)))
+    first, again, other = (network(nobody, drawn(seed)).rgb for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert torch.equal(first, other) == (deviation == 0)
+
+
+@torch.no_grad()
 def test_an_object_that_is_taken_away_changes_only_what_it_covered() -> None:
     network = made(objects=1)
     scenes = network.sample(4, drawn())

@@ -124,7 +124,7 @@ def test_dense_samples_of_a_box_are_those_within_it() -> None:
 
 def test_depths_are_random_within_their_strata() -> None:
     rays, at = along_x(*[(0.0, 0.0)] * 50), boxes([0.0, 0.0, 0.0])
-    for sampling in (BoxSampling(4, 3), DenseSampling(16)):
+    for sampling in (BoxSampling(4, 3, shaken_background=True), DenseSampling(16)):
         usual, first, again, other = (
             taken(sampling, rays, at, None if seed is None else torch.Generator().manual_seed(seed))
             for seed in (None, 1, 1, 2)
@@ -135,6 +135,13 @@ def test_depths_are_random_within_their_strata() -> None:
         shift = (first.background.depths - usual.background.depths).abs()
         assert 0.4 * stratum < float(shift.max()) <= stratum / 2 + 1e-5
         assert abs(float((first.background.depths - usual.background.depths).mean())) < 0.05 * stratum
+
+
+def test_depths_of_a_background_stay_unless_asked_otherwise_and_those_of_objects_do_not() -> None:
+    rays, at = along_x(*[(0.0, 0.0)] * 50), boxes([0.0, 0.0, 0.0])
+    usual, shaken = (taken(BoxSampling(4, 3), rays, at, each) for each in (None, torch.Generator().manual_seed(1)))
+    assert torch.equal(usual.background.depths, shaken.background.depths)
+    assert not torch.equal(usual.objects.depths, shaken.objects.depths)
 
 
 def test_the_published_last_length_is_a_hole_where_nothing_is() -> None:
