@@ -14,6 +14,7 @@ from torch import nn
 
 from rendra_lab import zoo
 from rendra_lab.errors import UserError
+from rendra_lab.tasks.giraffe.generator import Generator
 from rendra_lab.weights_file import write_weights_file
 
 RECORD = {
@@ -154,3 +155,25 @@ def test_folders_that_are_no_runs(tmp_path: Path) -> None:
     (run / "metrics.json").unlink()
     with pytest.raises(UserError, match="says nothing of its end"):
         zoo.keep(run, "dots", tmp_path / "zoo", weights=str(run / "weights.safetensors"))
+
+
+def test_what_is_kept_beside_the_code_works() -> None:
+    folder = Path(__file__).parents[2] / "zoo"
+    assert "giraffe_cow" in zoo.names(folder)
+    for name in zoo.names(folder):
+        network = zoo.load(name, folder)
+        assert f"parameters: {sum(each.numel() for each in network.parameters()):,}" in (
+            folder / name / "card.md"
+        ).read_text(encoding="utf-8")
+    assert all((folder / name / "weights.safetensors").stat().st_size < 4e6 for name in zoo.names(folder))
+
+
+@torch.no_grad()
+def test_the_kept_cows_are_seen_before_their_meadows() -> None:
+    cows = zoo.load("giraffe_cow", Path(__file__).parents[2] / "zoo")
+    assert isinstance(cows, Generator)
+    made = cows(cows.sample(16, torch.Generator().manual_seed(0), 0.65))
+    share = made.shares[:, 0].mean((1, 2))
+    assert 0.02 < float(share.min()) <= float(share.max()) < 0.2
+    ground = made.rgb[:, :, -16:].mean((0, 2, 3))
+    assert float(ground[1]) > float(ground[2])  # more green than blue
