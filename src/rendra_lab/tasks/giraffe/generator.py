@@ -139,15 +139,14 @@ class Generator(nn.Module):
         return torch.cat([self._look(part, None)[0] for part in self._parts(scenes)])
 
     def alpha_maps(self, scenes: Scenes) -> Float[Tensor, "B T V V"]:
-        """Opacity of each object, and last of the background, as if it were alone in the world."""
+        """Opacity of each object, and last of the background, as if it were alone in the world; a wall is opaque."""
         rays, own = self._rays(scenes)
         samples = self.sampling.samples(rays, own, scenes.boxes.exists, None)
         objects = self._objects(scenes, own, samples.objects, None)
         background = self._background(scenes, rays, samples.background, None)
-        alone = self.sampling.alone
-        return self._maps(
-            samples, alone(samples.objects, objects.density), alone(samples.background, background.density), scenes
-        )
+        nobody = torch.zeros_like(objects.density)
+        walled = self.sampling.weights(samples, nobody, background.density)[1].sum(1)
+        return self._maps(samples, self.sampling.alone(samples.objects, objects.density), walled, scenes)
 
     def _parts(self, scenes: Scenes) -> list[Scenes]:
         """As many at once as near memory holds without gradients, which need all at once."""

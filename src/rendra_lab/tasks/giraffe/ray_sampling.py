@@ -85,7 +85,7 @@ class Sampling(ABC):
 
     @abstractmethod
     def alone(self, pieces: Pieces, densities: Tensor) -> Tensor:
-        """Opacity (L,) of pieces with nothing else in the world."""
+        """Opacity (L,) of objects' pieces with nothing else in the world."""
 
 
 class DenseSampling(Sampling):

@@ -197,6 +197,7 @@ def test_alpha_maps_show_each_thing_alone() -> None:
             lonely = replace(scenes, boxes=replace(scenes.boxes, exists=exists))
             assert_close(network.alpha_maps(lonely)[:, n], alone[:, n])
         assert bool((alone[:, :2] >= network(scenes).shares[:, :2] - 1e-5).all())
+        assert_close(alone[:, 2], torch.ones(3, 4, 4))  # it ends with a wall
 
 
 def test_scenes_come_from_one_generator_alone() -> None:
