@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import nn
 
 
-def begin_as_varied(layer: nn.Linear | nn.Conv2d, slope: float = 0.0, summands: int = 1) -> None:
+def he_init(layer: nn.Linear | nn.Conv2d, slope: float = 0.0, summands: int = 1) -> None:
     """Weights such that deep layers vary as much with the input as the first ones, and biases of 0.
 
     He et al., "Delving Deep into Rectifiers", ICCV 2015, Eq. 10 and 15. PyTorch's own weights have a sixth of this

@@ -7,7 +7,7 @@ from itertools import pairwise
 from torch import Tensor, nn
 
 from rendra_lab.errors import UserError
-from rendra_lab.networks.initialization import begin_as_varied
+from rendra_lab.networks.initialization import he_init
 from rendra_lab.settings import Positive
 
 _SLOPE = 0.2  # of leaky ReLUs
@@ -23,7 +23,7 @@ class Discriminator(nn.Module):
         biases: of the convolutions. Published: none; then the logit of a black picture is 0 whatever is learned, and
             a generator that is told off too fast flees there, from where no gradient leads back.
         centred: colours are judged about 0, in [-1, 1]; published: in [0, 1].
-        torch_start: weights begin as PyTorch's do, as published: then the first thousand steps teach little.
+        torch_init: weights begin as PyTorch's do, as published: then the first thousand steps teach little.
 
     Raises:
         UserError: another side, or fewer channels than layers can halve.
@@ -35,7 +35,7 @@ class Discriminator(nn.Module):
         widest: Positive = 512,
         biases: bool = True,
         centred: bool = True,
-        torch_start: bool = False,
+        torch_init: bool = False,
     ) -> None:
         super().__init__()
         layers = picture_side.bit_length() - 3
@@ -50,10 +50,10 @@ class Discriminator(nn.Module):
         widths = [3, *(widest >> (layers - number) for number in range(1, layers + 1))]
         convs = [nn.Conv2d(before, after, 4, 2, 1, bias=biases) for before, after in pairwise(widths)]
         last = nn.Conv2d(widest, 1, _LAST_SIDE, bias=biases)
-        if not torch_start:
+        if not torch_init:
             for conv in convs:
-                begin_as_varied(conv, _SLOPE)
-            begin_as_varied(last, slope=1.0)
+                he_init(conv, _SLOPE)
+            he_init(last, slope=1.0)
         self.layers = nn.Sequential(*(step for conv in convs for step in (conv, nn.LeakyReLU(_SLOPE))), last)
 
     def forward(self, pictures: Tensor) -> Tensor:

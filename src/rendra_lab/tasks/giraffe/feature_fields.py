@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
-from rendra_lab.networks.initialization import begin_as_varied
+from rendra_lab.networks.initialization import he_init
 from rendra_lab.settings import Count, Positive, Size
 
 _FEW, _MANY = 4096, 1 << 20  # points at a time, which fit into a core's cache, or keep a GPU busy
@@ -56,7 +56,7 @@ class FeatureField(nn.Module):
         point_scale: points are divided by it before they are encoded.
         views_downscaled: directions too, as in the published code.
         density_scale: densities are multiplied by it.
-        torch_start: weights begin as PyTorch's do, as published: then everything looks nearly the same at first.
+        torch_init: weights begin as PyTorch's do, as published: then everything looks nearly the same at first.
 
     Raises:
         UserError: skips that no layer has.
@@ -74,7 +74,7 @@ class FeatureField(nn.Module):
         point_scale: Size = 2.0,
         views_downscaled: bool = False,
         density_scale: Size = 1.0,
-        torch_start: bool = False,
+        torch_init: bool = False,
     ) -> None:
         super().__init__()
         if not all(1 <= number < layers for number in skips):
@@ -93,8 +93,8 @@ class FeatureField(nn.Module):
         self.from_appearance = nn.Linear(code, hidden)
         self.from_directions = nn.Linear(6 * view_octaves, hidden) if view_octaves else None
         self.out = nn.Linear(hidden, features)
-        if not torch_start:
-            self._begin()
+        if not torch_init:
+            self._he_init()
 
     def forward(self, at: Stretches, shape: Float[Tensor, "T Z"], appearance: Float[Tensor, "T Z"]) -> FieldValues:
         """Densities before noise, and hidden features, at points of things with these codes.
@@ -118,18 +118,18 @@ class FeatureField(nn.Module):
             density[rows, :most], hidden[rows, :most] = values.density, values.hidden
         return FieldValues(density, hidden)
 
-    def _begin(self) -> None:
+    def _he_init(self) -> None:
         for layer in self.trunk:
             assert isinstance(layer, nn.Linear)
-            begin_as_varied(layer)
+            he_init(layer)
         for layer in (self.from_points, self.from_shape, *self.skips_from_points, *self.skips_from_shape):
             assert isinstance(layer, nn.Linear)
-            begin_as_varied(layer, summands=2)
+            he_init(layer, summands=2)
         of_ray = [self.to_view, self.from_appearance, *([self.from_directions] if self.from_directions else [])]
         for layer in of_ray:
-            begin_as_varied(layer, summands=len(of_ray))
+            he_init(layer, summands=len(of_ray))
         for layer in (self.to_density, self.out):
-            begin_as_varied(layer, slope=1.0)
+            he_init(layer, slope=1.0)
 
     def _at(self, at: Stretches, shape: Tensor, appearance: Tensor) -> FieldValues:
         points = at.origins.T[:, :, None] + at.depths * at.directions.T[:, :, None]

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rendra_lab.errors import UserError
-from rendra_lab.networks.initialization import begin_as_varied
+from rendra_lab.networks.initialization import he_init
 from rendra_lab.settings import Positive
 
 _SLOPE = 0.2  # of leaky ReLUs
@@ -28,7 +28,7 @@ class NeuralRenderer(nn.Module):
         rgb_skips: colours are summed over all resolutions; false takes those of the last alone.
         sigmoid: at the end; false clamps nothing.
         feature_upsampling, rgb_upsampling: `nearest` or `bilinear`, that followed by a small blur for the colours.
-        torch_start: weights begin as PyTorch's do, as published.
+        torch_init: weights begin as PyTorch's do, as published.
 
     Raises:
         UserError: sizes that are not a power of two apart.
@@ -44,7 +44,7 @@ class NeuralRenderer(nn.Module):
         sigmoid: bool = True,
         feature_upsampling: Literal["nearest", "bilinear"] = "nearest",
         rgb_upsampling: Literal["nearest", "bilinear"] = "bilinear",
-        torch_start: bool = False,
+        torch_init: bool = False,
     ) -> None:
         super().__init__()
         doublings = (max(picture_side // feature_side, 1)).bit_length() - 1
@@ -64,9 +64,9 @@ class NeuralRenderer(nn.Module):
             for number, width in enumerate(widths)
         )
         self.rgb_skips = rgb_skips
-        if not torch_start:
+        if not torch_init:
             for conv in convs:
-                begin_as_varied(conv, _SLOPE)
+                he_init(conv, _SLOPE)
 
     def forward(self, features: Tensor) -> Tensor:
         """Pictures (B, 3, S, S), in [0, 1] with the sigmoid, of features (B, C, V, V)."""

@@ -115,9 +115,9 @@ def test_a_skip_behind_the_last_layer_is_none() -> None:
 @torch.no_grad()
 def test_places_differ_from_the_start_and_hardly_as_published() -> None:
     spread = []
-    for torch_start in (False, True):
+    for torch_init in (False, True):
         torch.manual_seed(0)
-        field = FeatureField(16, 32, 6, 8, 4, 2, [3], torch_start=torch_start)
+        field = FeatureField(16, 32, 6, 8, 4, 2, [3], torch_init=torch_init)
         spread.append(float(field(at(), torch.zeros(3, 8), torch.zeros(3, 8)).density.std()))
     assert spread[0] > 0.2
     assert spread[1] < 0.5 * spread[0]
